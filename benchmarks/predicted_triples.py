@@ -115,7 +115,7 @@ def predicted(
         part = split_by_series(given.table, samples.tower, samples.channel)
         said, near = predicted_at(given, part, samples.time_s, samples.position_m, flown.heading_deg)
         if near.sum() >= FEWEST:
-            card = level_card(samples.time_s, samples.residual_db + flown.free_space_db, said)
+            card = level_card(samples.time_s, samples.residual_db + flown.free_space_db, said, near)
             sd_db = float(np.sqrt(np.nanmean(np.square(said["sd_db"]))))
             numbers = card.coverage_90, card.rmse_db, card.rmse_offset_db, sd_db, card.crps_db
             rows.append(dict(zip(NAMES, numbers, strict=True)))

@@ -71,10 +71,10 @@ def level_card(
     time_s: FloatArray,
     measured_db: FloatArray,
     predicted: Mapping[str, FloatArray],
+    scored: BoolArray,
     thresholds_db: Sequence[float] = (),
     *,
     absolute: bool = True,
-    scored: BoolArray | None = None,
 ) -> LevelCard:
     """Return the scores of a predicted level.
 
@@ -89,20 +89,18 @@ def level_card(
         samples with both levels: ``sd_db`` (standard deviation of one sample; the error is normal), ``q05_db`` and
         ``q95_db`` (ends of the 90 % interval, else those of the distribution), and the columns :data:`LOCK` (two parts,
         instead of a normal error).
+    scored : (n,) bool
+        Samples that the prediction covers. There, a predicted NaN means a predicted outage.
     thresholds_db : sequence of float
         Measured levels whose exceedance is compared.
     absolute : bool
         True if the levels have the reference of the measurement, so that no offset is needed.
-    scored : (n,) bool, optional
-        Samples that the prediction covers. There, a predicted NaN means a predicted outage. By default, samples with a
-        predicted level.
 
     Returns
     -------
     LevelCard
     """
     level = predicted["level"]
-    scored = np.isfinite(level) if scored is None else scored
     heard, reached = np.isfinite(measured_db) & scored, np.isfinite(level) & scored
     both = heard & reached
     measured, expected = measured_db[both], level[both]

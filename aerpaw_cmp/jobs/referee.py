@@ -35,6 +35,7 @@ from ..compare.rank import MAX_RANK, compare_ranks
 from ..compare.receiver import score_forecast
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
 from ..compare.statistics import FEWEST, paired_difference
+from ..flight.clock import clock_trap
 from ..flight.data import FlightData, load_data
 from ..flight.drafting.draft import DraftOptions, drafts
 from ..flight.gains import load_with_learned
@@ -71,6 +72,9 @@ _MOST_DB = 400.0
 
 # Positions that are all closer than this to the height of the take-off ground are not a flight [m].
 _ON_GROUND_M = 3.0
+
+# Scores of channels (see :func:`_series`) or of models.
+Entries = Sequence[Mapping[str, Any]]
 
 # A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.
 _NEAR_S = 0.5
@@ -419,11 +423,11 @@ def _check_repeats(table: pd.DataFrame) -> None:
 
     A route can pass a position several times: ``time_s`` after an unknown start distinguishes the passes.
     """
-    key = ["time"] if table["time"].notna().any() else [*_PLACE, *({"yaw_deg", "time_s"} & set(table))]
-    distinct = table.dropna(subset="level").drop_duplicates(["tower", "channel", *key, "level"])
-    twice = distinct[distinct.duplicated(["tower", "channel", *key], keep=False)]
+    key = ["tower", "channel", *(["time"] if table["time"].notna().any() else [*_PLACE, "yaw_deg", "time_s"])]
+    distinct = table.dropna(subset="level").drop_duplicates([*key, "level"])
+    twice = distinct[distinct.duplicated(key, keep=False)]
     if len(twice):
-        first = twice[["tower", *key]].iloc[0].dropna()
+        first = twice[key].iloc[0].drop("channel").dropna()
         where = ", ".join(f"{name} {f'{v:.2f}' if isinstance(v, float) else v}" for name, v in first.items())
         raise InputError(
             f"{counted(len(twice), 'row')} with several levels at one position: {where}",
@@ -471,7 +475,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     InputError
         If none of the predictions is near a sample.
     """
-    series = {item.name: entry for item in result.rss if given.quantity and (entry := _series(given, item, data))}
+    series = {item.name: entry for item in result.rss if (entry := _series(given, item, data))}
     ranks = {item.tower: r for item in result.rank if (r := _ranks(given, item, data))}
     if not series and not ranks:
         raise InputError(
@@ -524,12 +528,7 @@ def _means(model: str, cards: Sequence[referee.LevelCard]) -> dict[str, Any]:
     return {"model": model, "channels": len(cards), **dict(zip(referee.AVERAGED, values.mean(axis=0), strict=True))}
 
 
-def _sentence(
-    given: ForeignPrediction,
-    series: Sequence[Mapping[str, Any]],
-    common: Sequence[Mapping[str, Any]],
-    means: Sequence[Mapping[str, Any]],
-) -> str:
+def _sentence(given: ForeignPrediction, series: Entries, common: Entries, means: Entries) -> str:
     """Return both errors, whether the difference is significant, the errors as predicted, and the scored samples."""
     mean, errors = means[0], {row["model"]: row["rmse_offset_db"] for row in means}
     text = f"{given.path.name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel"
@@ -582,7 +581,7 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> dict
     seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")
     thresholds = referee.measured_thresholds(item.measured_db[near], ratio=item.unit == "dB")
     cards = {
-        key: referee.level_card(seconds, item.measured_db, columns, thresholds, absolute=absolute, scored=on)
+        key: referee.level_card(seconds, item.measured_db, columns, on, thresholds, absolute=absolute)
         for key, (columns, absolute, on) in models.items()
         if (np.isfinite(columns["level"]) & heard & on).sum() >= FEWEST
     }
@@ -669,10 +668,8 @@ def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData) -> dict
     return entry | {key: getattr(forecast, key) for key in ("log_score", "constant_log_score")}
 
 
-def _why_none(given: ForeignPrediction, data: FlightData, result: FlightResult) -> str | None:
+def _why_none(given: ForeignPrediction, data: FlightData, result: FlightResult) -> str:
     """Return the likely cause if no sample is near a prediction: channels, time zone, day, ground, datum or route."""
-    if not result.series:
-        return None
     ours, theirs = ({s.channel for s in result.rss}, set(given.table["channel"]) - {""})
     if theirs and ours.isdisjoint(theirs):
         return f"other names for the channels: {', '.join(sorted(theirs))}; the flight has {', '.join(sorted(ours))}"
@@ -715,9 +712,7 @@ def _other_time(given: ForeignPrediction, result: FlightResult) -> str:
     """Return the likely cause if no sample is near a predicted time."""
     flown = np.concatenate([item.time for item in result.series])
     theirs = given.table["time"].dropna().to_numpy("datetime64[ns]")
-    apart_h = float((np.median(theirs.astype(np.int64)) - np.median(flown.astype(np.int64))) / 3.6e12)
     (begin, end), (first, last) = (np.array([t.min(), t.max()], "datetime64[s]") for t in (theirs, flown))
-    spans = f"predicted {begin} to {end}, flown {first} to {last} (UTC)"
-    hours = round(apart_h * 2) / 2
-    zone = 0.5 <= abs(hours) <= 14.0 and abs(apart_h - hours) < 0.25
-    return f"another time zone, {hours:+g} h: {spans}" if zone else f"another flight, or too few times: {spans}"
+    trap = clock_trap((begin, end), (first, last))
+    cause = "another flight, or too few times" if trap is None else f"another time zone, {-trap.hours:+g} h"
+    return f"{cause}: predicted {begin} to {end}, flown {first} to {last} (UTC)"

@@ -31,7 +31,7 @@ from .columns import RANK, RSS, csv_text, described
 from .explorer import payload
 from .flight_data import RANKS, InputFile, ReportData, start_of
 from .flight_figures import figure_specs
-from .page import about, json_text, merge, rendered, write_figures, write_file
+from .page import about, json_text, links_of, merge, rendered, write_figures, write_file
 from .texts import clock, cut, duration, interval, k_key, minute, number, percent
 
 # Largest number of rejected lines that are shown per file.
@@ -275,11 +275,7 @@ def referee_card(data: ReportData) -> Card:
 def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     """Return the card of one prediction: means over channels, then each channel."""
     name = verdict["prediction"]
-    series = [
-        (f"{tower} {channel}".strip(), entry)
-        for tower, channels in verdict["levels"].items()
-        for channel, entry in channels.items()
-    ]
+    series = [(" ".join(link).strip(), entry) for link, entry in links_of(verdict["levels"]).items()]
     scores: dict[str, str | int] = {
         "Bias [dB]": 1, "RMSE [dB]": 1, "RMSE after offset": 1, "RMSE over 1 s": 1, "Correlation": 2, "CRPS [dB]": 2,
         "In 90 %": SHARE,

@@ -132,15 +132,15 @@ class AerpawCmpError(Exception):
 
 
 @contextmanager
-def about_file(path: str | Path) -> Iterator[None]:
-    """Add this path to errors from inside the block that do not name a file."""
+def about_file(path: str | Path, line: int | None = None) -> Iterator[None]:
+    """Add this path, and the line if none is known, to errors from inside the block that do not name a file."""
     try:
         yield
     except AerpawCmpError as error:
         if error.path is not None:
             raise
         raise type(error)(
-            error.found, expected=error.expected, cause=error.cause, path=path, line=error.line
+            error.found, expected=error.expected, cause=error.cause, path=path, line=error.line or line
         ) from error
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..common.cf import file_attributes, netcdf_bytes
-from ..common.errors import InputError, UsageError, noting_interrupts
+from ..common.errors import InputError, UsageError, about_file, noting_interrupts
 from ..common.outputs import file_digest
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
@@ -60,7 +61,7 @@ from ..propagation.replay import Replay, replay
 from ..report import maps as page
 from ..report.prediction import outside_share
 from ..site.site import Site
-from ..site.siteyaml import inputs_of_site, load_site, site_model
+from ..site.siteyaml import inputs_of_site, load_site, place_of, site_model
 from .predict import CorrectedMaps
 from .tasks import code_digest
 from .workers import InProcess, Lost, Workers
@@ -191,13 +192,13 @@ def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -
     """
     given = {name: value for name, value in chosen.items() if value is not None}
     stated = site_model(site).coverage.model_dump(exclude_none=True)
-    if "carrier_ghz" in stated:
-        stated["carrier_hz"] = 1e9 * stated.pop("carrier_ghz")
-    if {"threshold_dbm", "threshold_snr_db"} & set(given):
+    carrier = {"carrier_hz": 1e9 * stated.pop("carrier_ghz")} if "carrier_ghz" in stated else {}
+    options = {item.name: given.pop(item.name) for item in fields(LinkBudget) if item.name in given}
+    if {"threshold_dbm", "threshold_snr_db"} & set(options):
         stated = {name: value for name, value in stated.items() if not name.startswith("threshold")}
-    every = (QUICK if quick else {}) | stated | given
-    budget = {item.name: every.pop(item.name) for item in fields(LinkBudget) if item.name in every}
-    return MapSettings(budget=LinkBudget(**budget), **every)
+    with nullcontext() if options else about_file(*place_of(site, "coverage")):
+        budget = LinkBudget(**stated | options)
+    return MapSettings(budget=budget, **(QUICK if quick else {}) | carrier | given)
 
 
 # --- the engine ----------------------------------------------------------------------------------------------------

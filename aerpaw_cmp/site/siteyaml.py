@@ -369,6 +369,12 @@ def site_model(name_or_path: str | Path) -> SiteModel:
     return _find(name_or_path)[1]
 
 
+def place_of(name_or_path: str | Path, *location: Any) -> tuple[str, int | None]:
+    """Return the file of a site, and the line of one of its keys."""
+    path, _, line_of = _find(name_or_path)
+    return path, line_of(location)
+
+
 def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml") or path.is_file():

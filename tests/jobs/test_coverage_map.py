@@ -370,6 +370,14 @@ def test_options_replace_the_link_budget_of_the_site(tmp_path):
         .budget.sentence()
         .startswith("Transmit power 23 dBm; noise floor −98.0 dBm")
     )
+    with pytest.raises(UsageError, match="below the noise floor") as refused:
+        coverage_map.map_settings(str(file), {"threshold_dbm": -130.0})
+    assert refused.value.path is None  # the option is wrong, not the file
     changed = coverage_map.map_settings(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None}).budget
     assert (changed.tx_power_dbm, changed.threshold_snr_db, changed.level_dbm) == (23, None, -90.0)
     assert coverage_map.map_settings("lake_wheeler", {}).budget == PAPER_BUDGET
+    file.write_text(file.read_text().replace("bandwidth_mhz: 10, ", ""))
+    with pytest.raises(UsageError, match="without a bandwidth") as refused:
+        coverage_map.map_settings(str(file), {})
+    assert (str(refused.value.path), refused.value.line) == (str(file), 4)
+    assert coverage_map.map_settings(str(file), {"bandwidth_mhz": 10.0}).budget.threshold_snr_db == 3

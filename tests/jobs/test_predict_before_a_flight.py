@@ -95,6 +95,7 @@ def test_a_map_prints_the_coverage_of_one_element_and_of_the_array(
     command = ["map", str(place / "site.yaml"), *words, "--threshold-dbm", "-75", "-o", str(place / "map"), "-q"]
     assert main(command) == 0
     printed = capsys.readouterr().out
+    assert "nearest tower" not in printed  # of one tower it is this tower
     layers = pd.read_csv(place / "map" / "layers.csv")
     one, four = (100 * (layers[f"rss_{kind}_h060m_T1_none"] >= -75).mean() for kind in ("siso", "mimo"))
     assert one > four + 1.0

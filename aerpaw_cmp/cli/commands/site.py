@@ -10,7 +10,7 @@ from typer import Argument, Option
 from ...common.errors import UsageError
 from ...jobs.options import RunOptions
 from ..app import DryRun, Flights, Force, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
-from ..shown import answered, print_files, say, show, table, warn_all
+from ..shown import answered, print_files, records, say, show, table, warn_all
 
 
 @command(
@@ -251,11 +251,11 @@ def map_(
 def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
     """Print the share of covered positions per tower, antennas and height, for the foliage model of the paper."""
     lines: dict[tuple[str, str], dict[str, str]] = {}
-    for row in (row for row in rows if row["foliage"] == settings.shown):
+    alone = len({row["tower"] for row in rows}) == 2  # the nearest of one tower is this tower
+    for row in (row for row in rows if row["foliage"] == settings.shown and not (alone and row["tower"] == "joint")):
+        tower = row["tower"].replace("joint", "nearest tower")
         antennas = "one element" if row["antennas"] == "SISO" else f"{settings.elements} elements in phase"
-        line = lines.setdefault((row["tower"].replace("joint", "nearest tower"), antennas), {})
+        line = lines.setdefault((tower, antennas), {"tower": tower, "antennas": antennas})
         line[f"{row['altitude_m']:g} m"] = f"{100.0 * row['coverage']:.1f} %"
-    heads = ["tower", "antennas", *next(iter(lines.values()))]
-    table(
-        heads, [[*key, *line.values()] for key, line in lines.items()], f"Covered positions, foliage {settings.shown}"
-    )
+    columns = {name: name for line in lines.values() for name in line}
+    records(list(lines.values()), columns, f"Covered positions, foliage {settings.shown}")

@@ -14,6 +14,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.jobs import referee
+from aerpaw_cmp.report.flight import _prediction_card
 
 PREDICTIONS = Path(__file__).parents[1] / "predictions"
 pytestmark = pytest.mark.usefixtures("blank_pictures")
@@ -299,3 +300,16 @@ def test_the_logs_of_an_emulated_flight_are_a_prediction(flight: Path) -> None:
 
 def test_the_folder_of_the_flight_itself_is_no_prediction(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "logs of the scored flight itself" in refused(flight, flight / "s", capsys)
+
+
+def test_the_page_states_the_log_score_of_predicted_ranks_beside_their_own_row() -> None:
+    score = {"kappa": 0.2, "total_variation": 0.1, "agreement": 0.5}
+    ranks = {"matched": 30, "log_score": 1.25, "constant_log_score": 1.5}
+    scores = {"ours.csv": score, "ray tracing, K = 10": score}
+    card = _prediction_card({
+        "prediction": "ours.csv", "sentence": "", "remarks": [], "means": [], "levels": {}, "nodes": [],
+        "rank": {"LW1": {**ranks, "scores": scores}},
+    })  # fmt: skip
+    (table,) = (table for table in card.tables if table.rows)
+    assert list(table.columns)[-2:] == ["Log score", "Of the mean"]
+    assert [row[-2:] for row in table.rows] == [(1.25, 1.5), (None, None)]

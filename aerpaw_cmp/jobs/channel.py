@@ -22,7 +22,7 @@ from ..flight.gains import load_with_learned
 from ..flight.replay import replay_poses, valid_poses
 from ..flight.settings import FlightFile, LinkSettings
 from ..flight.track import interpolated, velocities_mps
-from ..flight.training import flight_logs
+from ..flight.training import is_training_data
 from ..propagation.geometry import Link, Poses, rotation_from_aircraft
 from ..propagation.options import extent_of
 from ..propagation.replay import check_band, subcarriers_hz
@@ -282,8 +282,9 @@ def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> C
     if not sources:
         remarks.append("No calibrated level: the site has no learned antennas of these towers near this carrier.")
         return lambda _: {}
-    trained_on = union(*(memory.known[source.antenna].entry.trained_on for source in sources.values()))
-    if set(trained_on) & set(flight_logs(data)):
+    known = [memory.known[source.antenna] for source in sources.values()]
+    trained_on = union(*(antenna.entry.trained_on for antenna in known))
+    if is_training_data(data, trained_on, union(*(end.marks for of in known for end in (of.tower, of.uav)))):
         remarks.append("The calibrated level was also learned from this flight's logs, so it is not a prediction.")
     units = ", ".join(dict.fromkeys(source.unit for source in sources.values()))
 

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import yaml
 
+import aerpaw_cmp as ac
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common import content as provenance
 from aerpaw_cmp.common.content import trained_on
@@ -337,3 +338,22 @@ def test_a_quarter_of_an_nr_flight_is_not_scored_by_the_receiver_that_learned_fr
     counted, notes = counted_once(flights)
     assert [data.settings.flight.name for data in counted] == ["whole"]
     assert notes == ["quarter contains readings of whole in another log: they are counted once"]
+
+
+@pytest.mark.field
+def test_channel_states_that_a_converted_training_flight_is_not_predicted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The packaged antennas of LW1 were learned from this flight, which has other bytes as a CSV."""
+    logs = ac.read(REAL / "dataset12" / "70m_fs20MHz.mat", timezone="America/New_York")
+    names = {"time": "Time", "latitude_deg": "Latitude", "longitude_deg": "Longitude", "altitude_m": "RelHomeAlt"}
+    table = logs["vehicle"][list(names)].rename(columns=names)
+    table["LW1 USRP1 power [dB]"] = logs["USRP1"]["rss_db"]
+    table.to_csv(tmp_path / "flight.csv", index=False)
+    link = {"carrier_hz": 3.3e9, "transmit_power_dbm": 40, "uav_transmits": True}
+    content = {"flight": "other_bytes", "site": "lake_wheeler", "logs": [{"path": "flight.csv"}], "link": {"rss": link}}
+    flight = write_yaml(tmp_path / "flight.yaml", content)
+    assert main(["channel", str(flight), "-o", str(tmp_path / "c"), "--format", "csv", "--step", "60", "--json"]) == 0
+    assert any(
+        "also learned from this flight's logs" in text for text in json.loads(capsys.readouterr().out)["warnings"]
+    )

@@ -8,7 +8,7 @@ and datums that a program is known to write. The rows are in ``dictionary.yaml``
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -69,11 +69,18 @@ class Quantity:
 _FULL_SCALE = "dB re full scale"
 # Words for a height, which patterns of the file name HEIGHT.
 _HEIGHT = r"(alt|altitude|height|hgt|elevation|ele)"
-# PyYAML's C loader, which all its wheels have, reads the file in 5 ms, with every value as text.
-_FILE: Mapping[str, Any] = yaml.load(
-    Path(__file__).with_name("dictionary.yaml").read_text(encoding="utf-8"),
-    Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader),
-)
+
+
+def table(path: Path) -> Mapping[str, Any]:
+    """Return a table that belongs to the program, with every value as text."""
+    # PyYAML's C loader, which all its wheels have, reads the dictionary in 10 ms
+    content: Mapping[str, Any] = yaml.load(
+        path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+    )
+    return content
+
+
+_FILE = table(Path(__file__).with_name("dictionary.yaml"))
 
 
 def _quantity(row: Mapping[str, Any]) -> Quantity:
@@ -88,6 +95,8 @@ def _quantity(row: Mapping[str, Any]) -> Quantity:
 QUANTITIES = tuple(_quantity(row) for row in _FILE["quantities"])
 _PATTERNS = {name: re.compile("".join(pieces)) for name, pieces in _FILE["patterns"].items()}
 ZONES: Mapping[str, Mapping[str, Any]] = _FILE["zones"]
+HINTS: Mapping[str, Sequence[str]] = _FILE["hints"]
+FIXES: Mapping[str, str] = _FILE["fixes"]
 # Hours east of UTC, and a zone with summer time, of each meaning of an ambiguous abbreviation.
 WINTER = {
     word: [(float(hours), zone) for zone, hours in meanings.items()] for word, meanings in ZONES["winter"].items()

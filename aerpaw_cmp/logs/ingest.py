@@ -569,16 +569,15 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
             skipped.append(Skipped(str(place), what))
             continue
         try:
-            if _is_archive(place):
-                inside, skipped_inside = _archive(place, options, chosen)
-                files, skipped = files + inside, skipped + skipped_inside
-            elif _is_flight_file(place):
+            if _is_flight_file(place):
                 known = {file.sha256 for file in files}
-                inside = [file for file in _flight_file(place, chosen) if file.sha256 not in known]
-                files += inside
+                files += (inside := [file for file in _flight_file(place, chosen) if file.sha256 not in known])
                 skipped += [] if inside else [Skipped(str(place), "a flight file without further logs")]
-            else:
-                files.append(read_file(place, options=options, reader=chosen))
+                continue
+            inside, below = _archive(place, options, chosen) if _is_archive(place) else (
+                [read_file(place, options=options, reader=chosen)], [])  # fmt: skip
+            files += inside
+            skipped += below
         except AerpawCmpError as error:
             meta = place.with_suffix(".sigmf-meta")
             skipped.append(Skipped.of(place, {meta.name} if meta.exists() else (), error))

@@ -294,16 +294,6 @@ def _way_out(head: bytes) -> str:
     return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 
-# Words in column names that the dictionary does not know, by quantity; the most reliable word first.
-_LIKE = {
-    "time": (
-        r"^(?!.*(elapsed|boot|up ?time)).*time", r"^(?!.*start).*(date|clock|stamp|epoch|utc)|^when|\bt\b",
-        r"time|second|\bm?jd\b", r"date",
-    ),
-    "latitude_deg": (r"\blat",), "longitude_deg": (r"\b(lon|lng)",), "altitude_m": (r"\b(alt|height|elev)",),
-}  # fmt: skip
-
-
 _NEGATIVE = re.compile(r'[ "]*-\d{1,3}(\.\d*)?[ "]*')
 
 
@@ -322,10 +312,10 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
     names = [name for name in names if not re.search(elsewhere, dictionary.plain(name))]
     fits = {
         what: [name for words in forms for name in names if re.search(words, dictionary.plain(name))]
-        for what, forms in _LIKE.items()
+        for what, forms in dictionary.HINTS.items()
     } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)] or levels}
     fits["rss_db"].sort(key=lambda name: dictionary.without_unit(name)[1] != "dbm")
-    if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in _LIKE)):
+    if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in dictionary.HINTS)):
         lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
         return f"a table of another kind; no column looks like {lacking}"
     if not (fits["latitude_deg"] and fits["longitude_deg"]):

@@ -297,8 +297,9 @@ ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
 
 class Count(NamedTuple):
-    """A unit of clocks: its nanoseconds, its pattern in column names, and the smallest count that is an epoch."""
+    """A unit of clocks: its name, nanoseconds, pattern in column names, and the smallest count that is an epoch."""
 
+    name: str
     ns: float
     said: re.Pattern[str]
     least_epoch: float
@@ -306,12 +307,12 @@ class Count(NamedTuple):
 
 # In the order in which a name is searched. 1e9 microseconds are a quarter of an hour of PX4's own clock, not an epoch.
 COUNTS = {
-    "ns": Count(1.0, re.compile(r"\bn(s|sec|anos\w*)\b"), 1e18),
-    "us": Count(1e3, re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"), 1e15),
-    "ms": Count(1e6, re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millis"), 1e12),
-    "s": Count(1e9, re.compile(r" s$|^s$|\bsec(ond)?s\b"), 1e9),
-    "min": Count(6e10, re.compile(r"\bmin(ute)?s?\b"), math.inf),
-    "h": Count(3.6e12, re.compile(r" h$|^h$|\bh(ou)?rs?\b"), math.inf),
+    "ns": Count("nanoseconds", 1.0, re.compile(r"\bn(s|sec|anos\w*)\b"), 1e18),
+    "us": Count("microseconds", 1e3, re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"), 1e15),
+    "ms": Count("milliseconds", 1e6, re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millis"), 1e12),
+    "s": Count("seconds", 1e9, re.compile(r" s$|^s$|\bsec(ond)?s\b"), 1e9),
+    "min": Count("minutes", 6e10, re.compile(r"\bmin(ute)?s?\b"), math.inf),
+    "h": Count("hours", 3.6e12, re.compile(r" h$|^h$|\bh(ou)?rs?\b"), math.inf),
 }
 
 _BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock

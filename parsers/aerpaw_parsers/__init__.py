@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 
-from aerpaw_cmp.readers import Reader
-
-from ._origins import CLOCKS, HEIGHTS
+from aerpaw_cmp.readers import Reader, dictionary
 
 # Modules in the order in which ``aerpaw-cmp formats`` lists them.
 _FORMATS = (
@@ -23,10 +22,14 @@ _FORMATS = (
 
 
 def _readers() -> Iterator[Reader]:
+    clocks, heights = (
+        {name: origin for origin, names in table.items() for name in names}
+        for table in dictionary.table(Path(__file__).with_name("origins.yaml")).values()
+    )
     for name in _FORMATS:
         module = import_module(f".{name}", __name__)
         for reader in getattr(module, "READERS", None) or (module.READER,):
-            clock, height = CLOCKS.get(reader.name, reader.clock_from), HEIGHTS.get(reader.name, reader.height_from)
+            clock, height = clocks.get(reader.name, reader.clock_from), heights.get(reader.name, reader.height_from)
             yield replace(reader, clock_from=clock, height_from=height)
 
 

@@ -90,7 +90,7 @@ def streams(
     more : mapping, optional
         Further attributes of the cells; the keys are values of ``more`` in the readings.
     unit : str
-        Unit of the levels. Many programs write dB for dBm, so that dB are relative only if they cannot be dBm.
+        Unit of the levels. Many programs write dB for dBm, so that dB are of full scale only if they cannot be dBm.
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
@@ -141,7 +141,7 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
     flag = rows.flag[row]
     outside = ~((level >= _RANGE_DBM[0]) & (level <= _RANGE_DBM[1]))
     relative = about["unit"] == "dB re full scale" or (about["unit"] == "dB" and 2 * outside.sum() > len(level))
-    unit = about["unit"] if relative else "dBm"
+    unit = "dB re full scale" if relative else "dBm"
     if relative:
         outside = ~np.isfinite(level)
     elif 2 * outside.sum() > len(level):

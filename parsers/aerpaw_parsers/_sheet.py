@@ -105,11 +105,7 @@ def _number(text: str) -> tuple[float, str]:
 
 
 # Words for the fix of a GNSS receiver, in the order in which they are tried, and MAVLink's number of each.
-_FIXES = tuple((re.compile(form), number) for form, number in (
-    (r"\bno\b|no ?(fix|gps|gnss)|invalid|none|lost|searching|^(n|v|f|false|void|bad)$", "0"), (r"float", "5"),
-    (r"rtk|fixed|\bint\b", "6"), (r"dgps|dgnss|diff|sbas", "4"), (r"\b2 ?d", "2"),
-    (r"\b3 ?d|single|autonomous|spp|\bok\b|valid|\bfix\b|^(y|a|t|yes|true|active|good)$", "3"),
-))  # fmt: skip
+_FIXES = tuple((re.compile(form), number) for form, number in dictionary.FIXES.items())
 
 
 def _fix(text: str) -> str:

@@ -446,14 +446,6 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
 # without a unit may have. Steps of 10 may be 10 ms, steps of 5 are 5 s.
 _FLIGHT_S, _LONGEST_STEP_S = 10_800.0, 60.0
 _LEAST_STEPS = {"s": 0.0, "ms": 10.0, "us": 2e3, "ns": 2e6}
-_NAMES = {
-    "s": "seconds",
-    "ms": "milliseconds",
-    "us": "microseconds",
-    "ns": "nanoseconds",
-    "min": "minutes",
-    "h": "hours",
-}
 # A log that is shorter than this if its numbers are seconds may be in minutes or hours [s].
 _SHORT_S = 60.0
 # Time steps of stationary loggers [s]. No program writes rows that are this many milliseconds apart.
@@ -522,8 +514,8 @@ def _numbers(
     others = [other for other in dict.fromkeys(("s", *known)) if other != unit]
     if unit == "s" and not others:
         return "relative_s", value, []
-    lasting = "; ".join(f"as {_NAMES[other]} {_lasting(value, other)}" for other in others)
-    text = f"the times are numbers without a unit: read as {_NAMES[unit]}, which is a guess"
+    lasting = "; ".join(f"as {_text.COUNTS[other].name} {_lasting(value, other)}" for other in others)
+    text = f"the times are numbers without a unit: read as {_text.COUNTS[unit].name}, which is a guess"
     text = f"{text} (the log lasts {_lasting(value, unit)}; {lasting})"
     advice = f"if it is wrong, write the unit in the column's name, such as 'time [{others[0]}]'"
     # A log that begins within the first hour counts from its start. A later log counts from midnight, unless the user

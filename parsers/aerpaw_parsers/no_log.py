@@ -11,11 +11,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from aerpaw_cmp.common import kml
 from aerpaw_cmp.logs import matfile
-from aerpaw_cmp.readers import InputError, Reader, ReadOptions, ReadResult, mostly
+from aerpaw_cmp.readers import InputError, Reader, ReadOptions, ReadResult, dictionary, mostly
 
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 _IS: Mapping[str, Callable[[bytes], bool]] = {
@@ -49,12 +47,7 @@ def _sniffer(entry: Mapping[str, Any]) -> Callable[[bytes], bool]:
     return sniff
 
 
-# PyYAML's C loader, which all its wheels have, is ten times as fast
-_KINDS: Mapping[str, Mapping[str, Any]] = yaml.load(
-    Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"),
-    Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader),
-)
 READERS: tuple[Reader, ...] = tuple(
     Reader(name=name, title=entry["what"], kinds=(), sample="", sniff=_sniffer(entry), read=_refuse(entry["what"]))
-    for name, entry in _KINDS.items()
+    for name, entry in dictionary.table(Path(__file__).with_suffix(".yaml")).items()
 )

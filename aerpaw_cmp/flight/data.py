@@ -187,6 +187,8 @@ class FlightData:
     """Clauses about clocks and heights that the summary of a report repeats."""
     cautions: tuple[str, ...] = ()
     """Sentences about settings of the user that do not fit the flight. They come before all other warnings."""
+    kept_marks: list[str] = field(init=False, default_factory=list, repr=False, compare=False)
+    """Fingerprints of the series, from :func:`.marks_of`. Empty until they are needed."""
     _links: dict[str, Link] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @property

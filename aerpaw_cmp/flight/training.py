@@ -7,12 +7,15 @@ A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 - ``start``: half seconds since 1970, empty if the log has no wall clock.
 - ``digits``: one digit every half second for the change of a level or a rank. It is the mean over 1 s minus the mean
   over 10 s, in steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
-- ``runs``: the smallest hashes of short runs of raw readings (a bottom-k sketch, Broder 1997), 8 hex digits each.
+- ``runs``: the smallest hashes of short runs of changes between readings, in steps of half a decibel (a bottom-k
+  sketch, Broder 1997), 8 hex digits each. Many remain after rounding to 0.1 dB. Another flight has others.
 
 Two fingerprints belong to one log if they share runs, or if their clocks agree and their digits correlate at some lag.
 The digits of a log correlate with those of a part of it, and with those of a thinned, resampled, rounded or scaled
 copy. The digits of repeated flights on one route also correlate, because of the ripple of the ground reflection. Only
-the clock and the raw readings distinguish such flights.
+the clock and the readings distinguish such flights.
+
+If one series of a flight is recognised, the whole flight is a training flight.
 """
 
 from __future__ import annotations
@@ -52,16 +55,21 @@ _SLACK, _HOUR = 120, 7200
 # data, the largest z values of two different logs are 7.3 and 5.7, and the smallest of a changed copy is 8.6.
 _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 
-# Number of readings per run, smallest number of changes in it (constant levels occur in every log), and strides.
-# Because of the strides, a copy with half or a quarter of the rows has the same runs.
-_RUN, _LEAST_CHANGES, _STRIDES = 24, 8, (1, 2, 4)
+# Number of changes per run, smallest number of them that are not 0 (constant levels occur in every log), and strides.
+# Because of the strides, a copy with every second to fifth row has the same runs.
+_RUN, _LEAST_CHANGES, _STRIDES = 16, 8, (1, 2, 3, 4, 5)
+
+# Steps of a change [dB]. The second is for logs without changes of the size of the first. The first is no multiple of
+# 0.1, because changes at the boundary of two steps would depend on rounding errors. Rounding to 0.1 dB leaves a quarter
+# of the runs. Of ten simulated repeats of a flight whose levels differ by 0.2 dB at equal places, none shares two runs.
+_CHANGES_DB = (0.51, 0.001)
 
 # A series with fewer different values has no runs, because ranks along one route change similarly on every flight.
 _FEWEST_VALUES = 6
 
-# Number of runs in a fingerprint, and number of common runs that shows one log. A tenth of a log has about 6 of 64 runs
-# in common with the log.
-_RUNS, _LEAST_SHARED = 64, 3
+# Number of runs in a fingerprint, and number of common runs that shows one log. A tenth of a log has about 12 of 128
+# runs in common with the log.
+_RUNS, _LEAST_SHARED = 128, 3
 
 # Multiplier of the hashes: 2^64 divided by the golden ratio, odd, so that it has an inverse.
 _ODD = 0x9E3779B97F4A7C15
@@ -117,18 +125,20 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
 
 
 def _runs(values: FloatArray) -> str:
-    """Return the smallest hashes of runs of changes [1/1000]. A constant gain does not alter changes."""
+    """Return the smallest hashes of runs of changes. A constant gain does not alter changes."""
     if len(np.unique(values)) < _FEWEST_VALUES:
         return ""
-    found = np.concatenate([_hashes(values[phase::stride]) for stride in _STRIDES for phase in range(stride)])
+    thinned = [values[phase::stride] for stride in _STRIDES for phase in range(stride)]
+    every = (np.concatenate([_hashes(some, step_db) for some in thinned]) for step_db in _CHANGES_DB)
+    found = next(filter(len, every), np.zeros(0, dtype=np.uint64))
     # sort only the smallest, because sorting millions of hashes would take a second
     least = np.partition(found, 10 * _RUNS)[: 10 * _RUNS] if len(found) > 10 * _RUNS else found
     return "".join(f"{code:08x}" for code in np.unique(least)[:_RUNS].tolist())
 
 
-def _hashes(values: FloatArray) -> AnyArray:
+def _hashes(values: FloatArray, step_db: float) -> AnyArray:
     """Return the hash of each run of readings with enough changes: a rolling polynomial modulo 2^64."""
-    steps = np.rint(np.diff(values) * 1e3).astype(np.int64).view(np.uint64)
+    steps = np.rint(np.diff(values) / step_db).astype(np.int64).view(np.uint64)
     if len(steps) < _RUN:
         return np.zeros(0, dtype=np.uint64)
     mixed = steps * np.uint64(_ODD)
@@ -247,7 +257,8 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
     """Return the logs of a series from which its antennas or the settings of its flight file were learned."""
     logs, settings = logs_of(data, series), data.settings
     patterns = learned_patterns(link, data.folder, data.site_place)
-    if among(series_mark(series), union(settings.marks, *(p.marks for p in patterns))):
+    learned = union(settings.marks, *(p.marks for p in patterns))
+    if any(among(mark, learned) for mark in marks_of([data])):
         return logs
     return common(logs, [settings.trained_on, *(p.trained_on for p in patterns)])
 
@@ -269,7 +280,12 @@ def series_mark(series: RssSeries | RankSeries) -> str:
 
 def marks_of(flights: Iterable[FlightData]) -> tuple[str, ...]:
     """Return the fingerprints of all series of some flights."""
-    return tuple(mark for data in flights for _, series in data.series if (mark := series_mark(series)))
+    every: list[str] = []
+    for data in flights:
+        if not data.kept_marks:
+            data.kept_marks.extend(series_mark(series) for _, series in data.series)
+        every += filter(None, data.kept_marks)
+    return tuple(every)
 
 
 @lru_cache(maxsize=64)
@@ -335,7 +351,7 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
             earlier = [] if set(logs) & set(again) else [flight for flight, mark in known if among(ours, [mark])]
             if earlier:
                 remarks.append(f"{name} contains readings of {earlier[0]} in another log: they are counted once")
-                again |= dict.fromkeys(logs, earlier[0])
+                again |= dict.fromkeys(flight_logs(data), earlier[0])
         known += [(name, ours) for _, ours in marked]
         rss = tuple(s for s in data.rss if not set(logs_of(data, s)) & set(again))
         rank = tuple(s for s in data.rank if not set(logs_of(data, s)) & set(again))

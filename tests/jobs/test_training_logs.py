@@ -1,6 +1,7 @@
 """Learned models are not scored on their training logs, for any name or archive of the log."""
 
 import bz2
+import dataclasses
 import gzip
 import json
 import shutil
@@ -21,7 +22,7 @@ from aerpaw_cmp.common.content import trained_on
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.flight.training import counted_once, flight_logs, marks_of
+from aerpaw_cmp.flight.training import counted_once, flight_logs, learned_here, marks_of
 from aerpaw_cmp.jobs.calibrate import CalibrationFile
 from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankCalibration, RankSamples, rank_samples, read_receiver
 from aerpaw_cmp.jobs.calibration_files import Calibrated, write_files
@@ -217,6 +218,11 @@ def test_a_part_of_a_training_log_in_another_layout_is_known_by_its_readings(fol
     assert words.startswith("Training flight: the antennas of LW1 USRP1 were learned from this flight")
     assert metrics["rss"]["LW1"]["USRP1"]["rmse_db"] is None
     assert all(row["rmse_heldout_db"] is None for row in metrics["ladder"] if "learned" in row["model"])
+    data = load_data(load_with_learned(copy_of(folder, half, link=learned["link"])), folder)
+    noise = np.random.default_rng(1).normal(-70.0, 3.0, len(data.rss[0].time))
+    series = dataclasses.replace(data.rss[0], channel="another", measured_db=noise)
+    for rss, logs in (((*data.rss, series), flight_logs(data)), ((series,), ())):  # one series identifies the flight
+        assert learned_here(dataclasses.replace(data, rss=rss), series, data.link_of(data.rss[0])) == logs
     names = ["first.yaml", copy_of(folder, half).name, "second.yaml", "aside.yaml"]
     counted, notes = counted_once([load_data(load_flight(folder / name), folder) for name in names])
     assert [data.settings.flight.name for data in counted] == ["first", "second", "aside"]

@@ -107,8 +107,8 @@ class Footprints:
     forests: list[Forest] = field(default_factory=list)
     geofences: list[Geofence] = field(default_factory=list)
     trees: list[SingleTreeModel] = field(default_factory=list)
-    ground: list[tuple[float, float, float]] = field(default_factory=list)
-    """East, north and elevation above sea level of points of the maps [m]."""
+    ground: list[tuple[Position, float]] = field(default_factory=list)
+    """Points of the maps with their elevation above sea level [m]."""
     credits: list[str] = field(default_factory=list)
     assumed: str = ""
     actions: list[str] = field(default_factory=list)
@@ -177,9 +177,7 @@ def import_footprints(
         with about_file(path):
             _check_place(content, frame)
             _sort(content, Path(path).name, frame, untagged, shapes, result.actions)
-        for place, height_m in content.ground:
-            east, north = frame.to_local(*place)
-            result.ground.append((float(east), float(north), height_m))
+        result.ground += content.ground
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
     # inherit heights before duplicates are removed, because a part may inherit from a duplicate
@@ -722,8 +720,8 @@ def _around_towers(content: dict[str, Any], imports: Footprints, frame: SiteFram
     around = [place.buffer(_NEAR_TOWER_M) for place in positions if place.distance(positions[0]) <= FAR_M]
     west, south, east, north = shapely.union_all([mapped, *around]).bounds
     area = content["area_m"] = [math.floor(west), math.ceil(east), math.floor(south), math.ceil(north)]
-    known = [[round(value, 2) for value in (*point, _ELEVATION_SD_M)] for point in imports.ground if
-             reach.contains(Point(point[:2]))]  # fmt: skip
+    known = [[round(float(value), 2) for value in (*frame.to_local(*place), height_m, _ELEVATION_SD_M)]
+             for place, height_m in imports.ground if reach.contains(Point(frame.to_local(*place)))]  # fmt: skip
     ground = "flat (the map has fewer than three elevations; --dem FILE names an elevation model)"
     if "dem" in content:
         ground = f"the elevation model {content['dem']['path']}, whose heights are above sea level (dem.reference)"

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -227,12 +226,12 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
         known["level_dbm"] = dims[:-2], rss_dbm(mean_pair_power(real + 1j * imaginary), power_dbm)
         remarks = (f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.",)
     main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in known), None)
+    frame: pd.DataFrame = pd.DataFrame(columns=list(known))
     if main is None:
-        unknown: pd.DataFrame = pd.DataFrame(columns=list(known))
-        return unknown
-    shape = dict(zip(known[main][0], known[main][1].shape, strict=True))
-    _check_rows(math.prod(shape.values()))
-    at = dict(zip(shape, np.indices(tuple(shape.values())).reshape(len(shape), -1), strict=True))
+        return frame
+    dims, array = known[main]
+    _check_rows(array.size)
+    at = dict(zip(dims, np.indices(array.shape).reshape(len(dims), -1), strict=True))
     columns = {
         name: array[tuple(at[dim] for dim in dims)]
         for name, (dims, array) in known.items()
@@ -246,7 +245,7 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
             with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
                 after = pd.to_timedelta(columns["time_s"], unit=size.strip().lower())  # type: ignore[call-overload]
                 columns["time"] = np.asarray(pd.to_datetime(start, utc=True) + after)
-    frame: pd.DataFrame = pd.DataFrame(columns)
+    frame = pd.DataFrame(columns)
     frame.attrs = {"remarks": remarks}
     return frame
 
@@ -446,10 +445,9 @@ def _check_names(table: pd.DataFrame, data: FlightData) -> None:
         found = f"towers {', '.join(theirs[:8]) or 'without names'}"
         cause = "other names for the same towers; rename them in the file"
         raise InputError(found, expected=f"towers of the flight: {', '.join(sorted(ours))}", cause=cause)
-    channels = table[table["level"].notna()].groupby("tower")["channel"].unique()
-    named = {channel for of_tower in channels for channel in of_tower}
-    if channels.str.len().max() == 1 and named.isdisjoint(s.channel for s in data.rss):
-        table["channel"] = table["channel"].replace(dict.fromkeys(named, ""))
+    named = table.loc[table["level"].notna(), ["tower", "channel"]].drop_duplicates()
+    if named["tower"].is_unique and not named["channel"].isin([s.channel for s in data.rss]).any():
+        table.loc[table["channel"].isin(named["channel"]), "channel"] = ""
 
 
 # --- scores --------------------------------------------------------------------------------------------------------
@@ -661,9 +659,8 @@ def _ranks(given: ForeignPrediction, item: RankResult, data: FlightData) -> dict
     measured = item.measured[scored]
     named = {given.path.name: rank, f"ray tracing, K = {best:g}": item.rank[best]}
     scores = {name: compare_ranks(measured, ranks[scored]) for name, ranks in named.items()}
-    scored &= stated
     constant = p[stated].sum(axis=0) / max(stated.sum(), 1)
-    forecast = score_forecast(item.measured[scored], p[scored], rank[scored], constant)
+    forecast = score_forecast(measured, p[scored], rank[scored], constant)
     entry = {"tower": item.tower, "matched": len(measured), "unmatched": int((~near).sum()), "scores": scores}
     return entry | {key: getattr(forecast, key) for key in ("log_score", "constant_log_score")}
 
@@ -700,10 +697,7 @@ def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightRes
     )
     ground = data.site.takeoff_ground_m * (1.0 - flat)
     corrected = {datum: points - apart_m * (1.0 - flat), "heights in feet": ground + (points - ground) * [1, 1, FOOT_M]}
-    shares = {
-        cause: float(referee.nearest_points(flown, places, given.near_m)[1].mean())
-        for cause, places in corrected.items()
-    }
+    shares = {cause: referee.nearest_points(flown, at, given.near_m)[1].mean() for cause, at in corrected.items()}
     cause = max(corrected, key=shares.__getitem__)
     return cause if shares[cause] > 0.5 else None
 

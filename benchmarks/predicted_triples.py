@@ -117,7 +117,7 @@ def predicted(
         if near.sum() >= FEWEST:
             card = level_card(samples.time_s, samples.residual_db + flown.free_space_db, said, near)
             sd_db = float(np.sqrt(np.nanmean(np.square(said["sd_db"]))))
-            numbers = card.coverage_90, card.rmse_db, card.rmse_offset_db, sd_db, card.crps_db
+            numbers = card["coverage_90"], card["rmse_db"], card["rmse_offset_db"], sd_db, card["crps_db"]
             rows.append(dict(zip(NAMES, numbers, strict=True)))
     return rows
 

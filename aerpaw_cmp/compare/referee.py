@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,47 +26,6 @@ AVERAGED = ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "correlation",
 LOCK = ("p_lock", "locked_db", "lost_db", "locked_sd_db", "lost_sd_db")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LevelCard:
-    """The scores of one predicted level on the samples that both prediction and measurement have.
-
-    Parameters
-    ----------
-    n : int
-        Number of samples with a measured and a predicted level.
-    bias_db, rmse_db : float, optional
-        Mean of measured minus predicted and RMSE, without an offset. None if the levels have no common reference.
-    offset_db, rmse_offset_db : float
-        Offset that is added to the measurement, and RMSE after this offset. It is fitted on the scored samples.
-    rmse_1s_db : float
-        RMSE of means over 1 s, after their own offset.
-    correlation, slope : float
-        Pearson correlation, and slope of measured over predicted level (least squares). NaN if the prediction is
-        constant.
-    crps_db, coverage_90 : float, optional
-        Continuous ranked probability score and share inside the 90 % band; None without a band.
-    exceedance : tuple of mapping
-        ``predicted`` and ``measured`` share of samples at or above ``threshold_db``. If the levels have no common
-        reference, the offset is applied first.
-    outages_missed, outages_invented : int
-        Number of outages where a level was predicted, and of levels where an outage was predicted.
-    """
-
-    n: int
-    bias_db: float | None
-    rmse_db: float | None
-    offset_db: float
-    rmse_offset_db: float
-    rmse_1s_db: float
-    correlation: float
-    slope: float
-    crps_db: float | None
-    coverage_90: float | None
-    exceedance: tuple[Mapping[str, float], ...]
-    outages_missed: int
-    outages_invented: int
-
-
 def level_card(
     time_s: FloatArray,
     measured_db: FloatArray,
@@ -75,8 +34,8 @@ def level_card(
     thresholds_db: Sequence[float] = (),
     *,
     absolute: bool = True,
-) -> LevelCard:
-    """Return the scores of a predicted level.
+) -> dict[str, Any]:
+    """Return the scores of a predicted level on the samples that both prediction and measurement have.
 
     Parameters
     ----------
@@ -98,7 +57,23 @@ def level_card(
 
     Returns
     -------
-    LevelCard
+    dict
+        The entry of card.json.
+
+        - ``n``: number of samples with a measured and a predicted level.
+        - ``bias_db rmse_db``: mean of measured minus predicted and RMSE, without an offset. None if the levels have no
+          common reference.
+        - ``offset_db rmse_offset_db``: offset that is added to the measurement, and RMSE after this offset. It is
+          fitted on the scored samples.
+        - ``rmse_1s_db``: RMSE of means over 1 s, after their own offset.
+        - ``correlation slope``: Pearson correlation, and slope of measured over predicted level (least squares). NaN
+          if the prediction is constant.
+        - ``crps_db coverage_90``: continuous ranked probability score and share inside the 90 % band; None without a
+          band.
+        - ``exceedance``: for each threshold the ``predicted`` and ``measured`` share of samples at or above
+          ``threshold_db``. If the levels have no common reference, the offset is applied first.
+        - ``outages_missed outages_invented``: number of outages where a level was predicted, and of levels where an
+          outage was predicted.
     """
     level = predicted["level"]
     heard, reached = np.isfinite(measured_db) & scored, np.isfinite(level) & scored
@@ -112,24 +87,24 @@ def level_card(
     # an outage counts as below any threshold
     theirs = np.where(reached, level + (0.0 if absolute else error.mean()), -np.inf)[scored]
     ours = np.where(heard, measured_db, -np.inf)[scored]
-    return LevelCard(
-        n=int(both.sum()),
-        bias_db=float(error.mean()) if absolute else None,
-        rmse_db=float(np.sqrt(np.mean(error**2))) if absolute else None,
-        offset_db=-float(error.mean()),
-        rmse_offset_db=float(error.std()),
-        rmse_1s_db=float(slow.std()),
-        correlation=r,
-        slope=r * float(np.std(measured) / (np.std(expected) or 1.0)),
-        crps_db=crps,
-        coverage_90=inside,
-        exceedance=tuple(
+    return {
+        "n": int(both.sum()),
+        "bias_db": float(error.mean()) if absolute else None,
+        "rmse_db": float(np.sqrt(np.mean(error**2))) if absolute else None,
+        "offset_db": -float(error.mean()),
+        "rmse_offset_db": float(error.std()),
+        "rmse_1s_db": float(slow.std()),
+        "correlation": r,
+        "slope": r * float(np.std(measured) / (np.std(expected) or 1.0)),
+        "crps_db": crps,
+        "coverage_90": inside,
+        "exceedance": [
             {"threshold_db": x, "predicted": float(np.mean(theirs >= x)), "measured": float(np.mean(ours >= x))}
             for x in thresholds_db
-        ),
-        outages_missed=int((reached & ~heard).sum()),
-        outages_invented=int((heard & ~reached).sum()),
-    )
+        ],
+        "outages_missed": int((reached & ~heard).sum()),
+        "outages_invented": int((heard & ~reached).sum()),
+    }
 
 
 def _distribution(

@@ -484,11 +484,11 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
         )
     name, predicted, every = given.path.name, set(given.table["tower"]), list(series.values())
     # means over different channels could not be compared
-    models: Mapping[str, referee.LevelCard] = max((entry["cards"] for entry in every), key=len, default={})
+    models: Mapping[str, Any] = max((entry["cards"] for entry in every), key=len, default={})
     common = {link: entry for link, entry in series.items() if entry["cards"].keys() >= models.keys()}
     means = [_means(model, [entry["cards"][model] for entry in common.values()]) for model in models]
     remarks = [*given.remarks]
-    if relative := sorted({entry["unit"] for entry in every if entry["cards"][name].bias_db is None}):
+    if relative := sorted({entry["unit"] for entry in every if entry["cards"][name]["bias_db"] is None}):
         units = f"{name}: {given.unit or given.quantity}; log: {', '.join(relative)}"
         remarks.append(f"No bias is stated, because levels and log have no common reference ({units}).")
     if unknown := sorted(predicted - {s.tower for _, s in data.series}):
@@ -512,7 +512,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
         "means": means,
         "levels": {s["tower"]: {o["channel"]: o for o in every if o["tower"] == s["tower"]} for s in every},
         "nodes": [
-            {"series": link, "offset_db": entry["cards"][name].offset_db, "slope": entry["cards"][name].slope,
+            {"series": link, **{key: entry["cards"][name][key] for key in ("offset_db", "slope")},
              "floor_db": entry["floor_db"]} for link, entry in series.items()
         ],
         "rank": ranks,
@@ -520,9 +520,9 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     return score
 
 
-def _means(model: str, cards: Sequence[referee.LevelCard]) -> dict[str, Any]:
+def _means(model: str, cards: Entries) -> dict[str, Any]:
     """Return the mean scores of a model over channels. NaN if a channel does not have the number."""
-    values = np.array([[getattr(card, key) for key in referee.AVERAGED] for card in cards], dtype=np.float64)
+    values = np.array([[card[key] for key in referee.AVERAGED] for card in cards], dtype=np.float64)
     return {"model": model, "channels": len(cards), **dict(zip(referee.AVERAGED, values.mean(axis=0), strict=True))}
 
 

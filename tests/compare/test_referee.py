@@ -26,14 +26,14 @@ def test_card_of_a_shifted_prediction_with_a_true_band() -> None:
     time, measured, level = series()
     card = level_card(time, measured, {"level": level - 5.0, "sd_db": np.full(N, np.hypot(2.0, 5.0))}, ALL, (-80.0,))
     error = measured - level + 5.0
-    assert card.bias_db == pytest.approx(error.mean(), abs=1e-9)
-    assert card.rmse_db == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-9)
-    assert card.offset_db == pytest.approx(-error.mean(), abs=1e-9)
-    assert card.rmse_offset_db == pytest.approx(2.0, abs=0.1)
-    assert card.rmse_1s_db == pytest.approx(error.std(), abs=1e-9)  # one sample per window
-    assert card.correlation == pytest.approx(6.0 / np.hypot(6.0, 2.0), abs=0.01)
-    assert card.slope == pytest.approx(1.0, abs=0.03)
-    (share,) = card.exceedance
+    assert card["bias_db"] == pytest.approx(error.mean(), abs=1e-9)
+    assert card["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-9)
+    assert card["offset_db"] == pytest.approx(-error.mean(), abs=1e-9)
+    assert card["rmse_offset_db"] == pytest.approx(2.0, abs=0.1)
+    assert card["rmse_1s_db"] == pytest.approx(error.std(), abs=1e-9)  # one sample per window
+    assert card["correlation"] == pytest.approx(6.0 / np.hypot(6.0, 2.0), abs=0.01)
+    assert card["slope"] == pytest.approx(1.0, abs=0.03)
+    (share,) = card["exceedance"]
     assert share["measured"] == pytest.approx(0.5, abs=0.03)
     assert share["predicted"] == pytest.approx(
         0.5 - 0.298, abs=0.03
@@ -45,17 +45,19 @@ def test_means_over_a_second_have_their_own_offset() -> None:
     rng = np.random.default_rng(4)
     time, fading_db = np.arange(20_000) / 400.0, 10.0 * np.log10(rng.exponential(size=20_000))
     card = level_card(time, -80.0 + fading_db, {"level": np.full(20_000, -80.0)}, np.full(20_000, True))
-    assert card.rmse_offset_db == pytest.approx(5.57, abs=0.15)
-    assert card.rmse_1s_db < 0.4  # 400 draws: 4.34 / 20 dB
+    assert card["rmse_offset_db"] == pytest.approx(5.57, abs=0.15)
+    assert card["rmse_1s_db"] < 0.4  # 400 draws: 4.34 / 20 dB
 
 
 def test_crps_and_coverage_of_a_calibrated_normal_band() -> None:
     time, measured, level = series()
     card = level_card(time, measured, {"level": level, "sd_db": np.full(N, 2.0)}, ALL)
-    assert card.crps_db == pytest.approx(2.0 / np.sqrt(np.pi), rel=0.03)  # expected CRPS of N(0, sd) is sd / sqrt(pi)
-    assert card.coverage_90 == pytest.approx(0.9, abs=0.015)
+    assert card["crps_db"] == pytest.approx(
+        2.0 / np.sqrt(np.pi), rel=0.03
+    )  # expected CRPS of N(0, sd) is sd / sqrt(pi)
+    assert card["coverage_90"] == pytest.approx(0.9, abs=0.015)
     band = {"level": level, "q05_db": level - 1.0, "q95_db": level + 1.0}
-    assert level_card(time, measured, band, ALL).coverage_90 == pytest.approx(0.383, abs=0.02)  # half a sd
+    assert level_card(time, measured, band, ALL)["coverage_90"] == pytest.approx(0.383, abs=0.02)  # half a sd
 
 
 def test_a_receiver_that_loses_its_lock_is_scored_by_both_parts_of_its_distribution() -> None:
@@ -70,27 +72,27 @@ def test_a_receiver_that_loses_its_lock_is_scored_by_both_parts_of_its_distribut
     # a second route to the number: CRPS = E|X - y| - E|X - X'| / 2, with draws of the forecast
     draws = np.where(rng.random((2, N)) < 0.7, rng.normal(-80.0, 2.0, (2, N)), rng.normal(-110.0, 1.0, (2, N)))
     expected = np.abs(draws[0] - measured).mean() - 0.5 * np.abs(draws[0] - draws[1]).mean()
-    assert mixed.crps_db == pytest.approx(expected, rel=0.05)
-    assert normal.crps_db is not None
-    assert mixed.crps_db < normal.crps_db - 0.2
-    assert mixed.coverage_90 == pytest.approx(0.9, abs=0.02)
+    assert mixed["crps_db"] == pytest.approx(expected, rel=0.05)
+    assert normal["crps_db"] is not None
+    assert mixed["crps_db"] < normal["crps_db"] - 0.2
+    assert mixed["coverage_90"] == pytest.approx(0.9, abs=0.02)
 
 
 def test_relative_levels_have_no_bias_and_exceed_after_the_offset() -> None:
     time, measured, level = series()
     card = level_card(time, measured, {"level": level + 140.0}, ALL, (-80.0,), absolute=False)
-    assert (card.bias_db, card.rmse_db, card.crps_db, card.coverage_90) == (None, None, None, None)
-    assert card.rmse_offset_db == pytest.approx(2.0, abs=0.1)
-    assert card.exceedance[0]["predicted"] == pytest.approx(0.5, abs=0.03)
+    assert (card["bias_db"], card["rmse_db"], card["crps_db"], card["coverage_90"]) == (None, None, None, None)
+    assert card["rmse_offset_db"] == pytest.approx(2.0, abs=0.1)
+    assert card["exceedance"][0]["predicted"] == pytest.approx(0.5, abs=0.03)
 
 
 def test_outages_on_either_side_are_counted_and_lie_below_any_threshold() -> None:
     time, measured, level = series()
     measured[:100], level[50:300] = np.nan, np.nan
     card = level_card(time, measured, {"level": level}, ALL, (-200.0,))
-    assert (card.outages_missed, card.outages_invented, card.n) == (50, 200, N - 300)
-    assert card.exceedance[0]["measured"] == pytest.approx(1.0 - 100 / N)
-    assert card.exceedance[0]["predicted"] == pytest.approx(1.0 - 250 / N)
+    assert (card["outages_missed"], card["outages_invented"], card["n"]) == (50, 200, N - 300)
+    assert card["exceedance"][0]["measured"] == pytest.approx(1.0 - 100 / N)
+    assert card["exceedance"][0]["predicted"] == pytest.approx(1.0 - 250 / N)
 
 
 def test_floor_is_the_lowest_level_if_it_is_repeated() -> None:
@@ -114,8 +116,8 @@ def test_a_constant_prediction_has_no_correlation_and_no_slope() -> None:
     time, measured, _ = series()
     rounded = np.full(N, -80.0) + np.resize([0.0, 1.4e-14], N)
     card = level_card(time, measured, {"level": rounded}, ALL)
-    assert np.isnan(card.correlation)
-    assert np.isnan(card.slope)
+    assert np.isnan(card["correlation"])
+    assert np.isnan(card["slope"])
 
 
 def test_nearest_points_by_trying_all() -> None:
@@ -153,7 +155,7 @@ def test_crps_of_single_samples_in_closed_form() -> None:
     time, level = np.zeros(1), np.zeros(1)
     for measured, crps in ((0.0, 3.0 * (np.sqrt(2.0) - 1.0) / np.sqrt(np.pi)), (90.0, 90.0 - 3.0 / np.sqrt(np.pi))):
         card = level_card(time, np.array([measured]), {"level": level, "sd_db": np.full(1, 3.0)}, ALL[:1])
-        assert card.crps_db == pytest.approx(crps, abs=1e-9)
+        assert card["crps_db"] == pytest.approx(crps, abs=1e-9)
 
 
 def test_a_paired_difference_in_closed_form() -> None:

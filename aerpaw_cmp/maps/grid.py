@@ -18,8 +18,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -499,14 +499,9 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
 
 
-# Name, smallest and largest value, unit, and likely cause of a value outside the range, by field of a link budget.
-_RANGES = {
-    "tx_power_dbm": ("transmit power", -60.0, 100.0, "dBm", "watts instead of dBm"),
-    "bandwidth_mhz": ("bandwidth", 1e-6, 1e5, "MHz", "Hz instead of MHz"),
-    "noise_figure_db": ("noise figure", 0.0, 60.0, "dB", "a noise factor instead of dB"),
-    "threshold_dbm": ("threshold", -200.0, 60.0, "dBm", "another unit than dBm"),
-    "threshold_snr_db": ("SNR threshold", -60.0, 100.0, "dB", "a level instead of an SNR"),
-}
+def _within(low: float, high: float, unit: str, name: str, cause: str, default: float | None = None) -> Any:
+    """Return a field with its smallest and largest value, and the likely cause of a value outside of this range."""
+    return field(default=default, metadata={"range": (low, high, unit, name, cause)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -542,17 +537,17 @@ class LinkBudget:
     -94.0
     """
 
-    tx_power_dbm: float = 40.0
-    bandwidth_mhz: float | None = None
-    noise_figure_db: float = 0.0
-    threshold_dbm: float | None = None
-    threshold_snr_db: float | None = None
+    tx_power_dbm: float = _within(-60.0, 100.0, "dBm", "transmit power", "watts instead of dBm", default=40.0)
+    bandwidth_mhz: float | None = _within(1e-6, 1e5, "MHz", "bandwidth", "Hz instead of MHz")
+    noise_figure_db: float = _within(0.0, 60.0, "dB", "noise figure", "a noise factor instead of dB", default=0.0)
+    threshold_dbm: float | None = _within(-200.0, 60.0, "dBm", "threshold", "another unit than dBm")
+    threshold_snr_db: float | None = _within(-60.0, 100.0, "dB", "SNR threshold", "a level instead of an SNR")
 
     def __post_init__(self) -> None:
-        for name, (what, low, high, unit, cause) in _RANGES.items():
-            value = getattr(self, name)
+        for item in fields(self):
+            value, (low, high, unit, name, cause) = getattr(self, item.name), item.metadata["range"]
             if value is not None and not low <= value <= high:
-                raise UsageError(f"a {what} of {value:g} {unit}", expected=f"{low:g} to {high:g} {unit}", cause=cause)
+                raise UsageError(f"a {name} of {value:g} {unit}", expected=f"{low:g} to {high:g} {unit}", cause=cause)
         if self.threshold_dbm is not None and self.threshold_snr_db is not None:
             raise UsageError("threshold_dbm and threshold_snr_db", expected="one of the two")
         if self.bandwidth_mhz is None and (self.noise_figure_db or self.threshold_snr_db is not None):

@@ -72,6 +72,9 @@ _MOST_DB = 400.0
 # Positions that are all closer than this to the height of the take-off ground are not a flight [m].
 _ON_GROUND_M = 3.0
 
+# A table, and fields of its :class:`ForeignPrediction`.
+Read = tuple[pd.DataFrame, dict[str, Any]]
+
 # Scores of channels (see :func:`_series`) or of models.
 Entries = Sequence[Mapping[str, Any]]
 
@@ -152,17 +155,16 @@ def read_foreign(path: Path, data: FlightData, near_m: float = AGAINST_DISTANCE_
     file = path / "prediction.csv" if (path / "prediction.csv").is_file() else path
     with about_file(path):
         if file.is_dir():
-            digest, frame = "", _emulated(path, data)
+            digest, (frame, about) = "", _emulated(path, data)
         else:
             content = read_input(file, _MOST_BYTES, "a prediction: CSV, NetCDF, .npz, or a folder")
             if content.startswith(b"CDF"):
                 raise InputError("a NetCDF file of version 3", expected="NetCDF 4 ('nccopy -k nc4 IN OUT')")
             read = next((reader for start, reader in _READERS.items() if content.startswith(start)), _csv)
-            digest, frame = file_digest(file), read(content, file)
+            digest, (frame, about) = file_digest(file), read(content, file)
         if file.name.startswith("prediction.") and (file.parent / "metrics.json").is_file():
-            frame.attrs["unit"] = _predicted_unit(file.parent / "metrics.json", data)
+            about["unit"] = _predicted_unit(file.parent / "metrics.json", data)
         quantity, table = _checked(frame, data)
-    about = {str(name): value for name, value in frame.attrs.items()}
     return ForeignPrediction(path=path, quantity=quantity, table=table, sha256=digest, near_m=near_m, **about)
 
 
@@ -188,18 +190,18 @@ def _predicted_unit(path: Path, data: FlightData) -> str:
 
 
 # --- formats -------------------------------------------------------------------------------------------------------
-# Each function returns a table with the column names of the file. Its attributes are the fields ``remarks`` and
-# ``unit`` of the prediction.
+# Each function returns a table with the column names of the file, and the fields ``remarks`` or ``unit`` of the
+# prediction, if they differ from their defaults.
 
 
-def _csv(content: bytes, path: Path) -> pd.DataFrame:
+def _csv(content: bytes, path: Path) -> Read:
     with parsing(path, "a CSV with a header: " + _EXPECTED, cause="another format"):
         frame = pd.read_csv(
             io.BytesIO(content), comment="#", skipinitialspace=True, low_memory=False, nrows=_MOST_ROWS + 1
         )
     _check_rows(len(frame))
     frame.columns = [str(name).strip().lower() for name in frame.columns]
-    return frame
+    return frame, {}
 
 
 def _check_rows(rows: int) -> None:
@@ -209,11 +211,11 @@ def _check_rows(rows: int) -> None:
         raise InputError(f"the prediction has more than {_MOST_ROWS} rows", expected=expected)
 
 
-def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
+def _netcdf(content: bytes, path: Path) -> Read:
     """Read variables along the dimensions of the level, one row per element."""
     with parsing(path, "a NetCDF file"):
         values, notes = read_native("netcdf", content)
-    remarks: tuple[str, ...] = ()
+    about: dict[str, Any] = {}
     # dimensions and values of each variable by its name
     known = {name.lower(): (notes["dims"][name][: array.ndim], array) for name, array in values.items()}
     if "up_m" in known:
@@ -224,11 +226,10 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
         power_dbm = float(notes["attributes"].get("transmit_power_dbm", 0.0))
         (dims, real), (_, imaginary) = known["h_real"], known["h_imag"]
         known["level_dbm"] = dims[:-2], rss_dbm(mean_pair_power(real + 1j * imaginary), power_dbm)
-        remarks = (f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.",)
+        about = {"remarks": (f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.",)}
     main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in known), None)
-    frame: pd.DataFrame = pd.DataFrame(columns=list(known))
     if main is None:
-        return frame
+        return pd.DataFrame(columns=list(known)), {}
     dims, array = known[main]
     _check_rows(array.size)
     at = dict(zip(dims, np.indices(array.shape).reshape(len(dims), -1), strict=True))
@@ -245,12 +246,10 @@ def _netcdf(content: bytes, path: Path) -> pd.DataFrame:
             with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
                 after = pd.to_timedelta(columns["time_s"], unit=size.strip().lower())  # type: ignore[call-overload]
                 columns["time"] = np.asarray(pd.to_datetime(start, utc=True) + after)
-    frame = pd.DataFrame(columns)
-    frame.attrs = {"remarks": remarks}
-    return frame
+    return pd.DataFrame(columns), about
 
 
-def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
+def _radio_map(content: bytes, path: Path) -> Read:
     """Read a radio map of Sionna RT, saved with ``np.savez(path_gain=..., cell_centers=..., tx_names=...)``."""
     needed = ("path_gain", "cell_centers", "tx_names")
     with parsing(path, f"an .npz with {', '.join(needed)}"), np.load(io.BytesIO(content)) as book:
@@ -269,15 +268,12 @@ def _radio_map(content: bytes, path: Path) -> pd.DataFrame:
     _check_rows(gain.size)
     places = np.tile(centre.reshape(-1, 3), (len(names), 1)).astype(np.float64)
     towers = np.repeat(names.astype(str), gain[0].size)
-    frame: pd.DataFrame = pd.DataFrame(places, columns=list(_PLACE)).assign(
-        tower=towers, path_loss_db=-db_from_power(gain.ravel())
-    )
     remark = "The cell centres of the radio map are taken as east, north and up of the site [m]."
-    frame.attrs = {"remarks": (remark,)}
-    return frame
+    frame = pd.DataFrame(places, columns=list(_PLACE)).assign(tower=towers, path_loss_db=-db_from_power(gain.ravel()))
+    return frame, {"remarks": (remark,)}
 
 
-def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
+def _emulated(folder: Path, data: FlightData) -> Read:
     """Read levels and positions from the logs of an emulated flight, which are matched by position."""
     own = folder / "flight.yaml"
     twin = load_data(load_with_learned(own) if own.is_file() else _drafted(folder, data), folder)
@@ -290,9 +286,8 @@ def _emulated(folder: Path, data: FlightData) -> pd.DataFrame:
         for o in observe([twin])[0]
     )
     # a hover has many levels at one position: their mean is what the emulator predicts there
-    frame: pd.DataFrame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False).mean()
-    frame.attrs = {"unit": ", ".join(sorted({s.unit for s in twin.rss}))}
-    return frame
+    frame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False).mean()
+    return frame, {"unit": ", ".join(sorted({s.unit for s in twin.rss}))}
 
 
 def _drafted(folder: Path, data: FlightData) -> FlightFile:

@@ -283,6 +283,7 @@ def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning |
     return placed
 
 
+@cache
 def without_unit(name: str) -> tuple[str, str]:
     """Return the plain name without its unit, and the unit in lower case or an empty text.
 

@@ -148,7 +148,7 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
         rows.warnings.append(
             f"{cell}: {outside.sum()} of {counted(len(level), 'level')} outside {_RANGE_DBM[0]:g} .. "
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
-            "read as out of coverage"
+            "read as missing"
         )
     # phones write the lowest value (3GPP TS 36.133, 9.1.4) if there is no signal; a weak cell approaches it gradually
     ends = (level == _END_DBM) & (about["quantity"] == "RSRP")
@@ -158,7 +158,10 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
         rows.warnings.append(f"{cell}: {levels} of {_END_DBM:g} dBm, none within 10 dB above: read as out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI is below RSRP, which is impossible: are the columns swapped?")
-    add_flag(flag, outside, "out_of_coverage")
+    # a level that is too high, unlike a missing one, says nothing about the coverage
+    high = outside & (level > _RANGE_DBM[1]) & ~np.isin(level, (0.0, *dictionary.UNAVAILABLE))
+    add_flag(flag, high, "level_out_of_range")
+    add_flag(flag, outside & ~high, "out_of_coverage")
     add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
     values: dict[str, AnyArray] = {"rss_db": level, "serving": table["served"].to_numpy()}

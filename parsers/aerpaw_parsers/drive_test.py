@@ -57,7 +57,10 @@ def has_radio(names: list[str]) -> bool:
 
 
 def _quantities(names: list[str]) -> set[str]:
-    return {what.quantity.name for what, *_ in dictionary.described(names)[1] if what is not None}
+    # sniffers test every line at the beginning of a file: few lines are those of a program with its own words
+    of_program = dictionary.program([*map(dictionary.plain, names)]) is not None
+    known = [what for what, *_ in dictionary.described(names)[1]] if of_program else map(dictionary.meaning, names)
+    return {what.quantity.name for what in known if what is not None}
 
 
 def _has_time(names: list[str]) -> bool:

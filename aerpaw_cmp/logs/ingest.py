@@ -571,13 +571,13 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
         try:
             if _is_flight_file(place):
                 known = {file.sha256 for file in files}
-                files += (inside := [file for file in _flight_file(place, chosen) if file.sha256 not in known])
-                skipped += [] if inside else [Skipped(str(place), "a flight file without further logs")]
-                continue
-            inside, below = _archive(place, options, chosen) if _is_archive(place) else (
-                [read_file(place, options=options, reader=chosen)], [])  # fmt: skip
-            files += inside
-            skipped += below
+                inside = [file for file in _flight_file(place, chosen) if file.sha256 not in known]
+                below = [] if inside else [Skipped(str(place), "a flight file without further logs")]
+            elif _is_archive(place):
+                inside, below = _archive(place, options, chosen)
+            else:
+                inside, below = [read_file(place, options=options, reader=chosen)], []
+            files, skipped = files + inside, skipped + below
         except AerpawCmpError as error:
             meta = place.with_suffix(".sigmf-meta")
             skipped.append(Skipped.of(place, {meta.name} if meta.exists() else (), error))

@@ -845,6 +845,48 @@ def nearest_in_time(times: AnyArray, of: AnyArray) -> tuple[IntArray, AnyArray]:
     return order[index], np.abs(at[index] - times)
 
 
+# Largest difference between the headings of a point and of a sample near it [deg].
+_TURNED_DEG = 45.0
+
+
+def nearest_points(
+    position_m: FloatArray, points_m: FloatArray, reach_m: float, nose_deg: tuple[FloatArray, FloatArray] | None = None
+) -> tuple[IntArray, BoolArray]:
+    """Return the nearest point (n,) of each sample, and whether it is near (n,).
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+        East, north, up of the samples; a sample with a NaN is near no point.
+    points_m : (points, 3)
+        At least one.
+    reach_m : float
+        Largest distance of a near point.
+    nose_deg : ((n,), (points,)), optional
+        Headings of samples and points. They are used only if all points and at least one sample have one.
+
+    Returns
+    -------
+    index : (n,) int
+    near : (n,) bool
+    """
+    from scipy.spatial import cKDTree
+
+    samples, points = position_m / reach_m, points_m / reach_m
+    if nose_deg is not None and np.isfinite(nose_deg[0]).any() and np.isfinite(nose_deg[1]).all():
+        apart = 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0)
+        samples, points = (
+            np.column_stack([place, np.sin(np.radians(nose)) / apart, np.cos(np.radians(nose)) / apart])
+            for place, nose in zip((samples, points), nose_deg, strict=True)
+        )
+    known = np.asarray(np.isfinite(samples).all(axis=1))
+    # near points are within 2**0.5, and a bound makes the search for far samples fast
+    index = cKDTree(points).query(np.where(known[:, None], samples, 0.0), distance_upper_bound=1.5)[1]
+    index = np.minimum(index, len(points) - 1)
+    away = samples - points[index]
+    return index, known & (np.linalg.norm(away[:, :3], axis=1) <= 1.0) & (np.linalg.norm(away[:, 3:], axis=1) <= 1.0)
+
+
 def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s: float) -> FloatArray:
     """Return the values of the nearest sample at requested times, NaN if no sample is near.
 

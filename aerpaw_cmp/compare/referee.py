@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray
 from .gains import BAND, NO_SPREAD, LostLock, StatedSpread
 from .level import local_mean_db
 from .statistics import correlation
@@ -132,45 +132,6 @@ def _distribution(
     if known("q05_db", "q95_db"):
         band = predicted["q05_db"], predicted["q95_db"]
     return crps, band and float(np.mean(((measured_db >= band[0]) & (measured_db <= band[1]))[both]))
-
-
-# Largest difference between the headings of a predicted point and a sample [deg].
-_TURNED_DEG = 45.0
-
-
-def nearest_points(
-    position_m: FloatArray, points_m: FloatArray, reach_m: float, nose_deg: tuple[FloatArray, FloatArray] | None = None
-) -> tuple[IntArray, BoolArray]:
-    """Return the nearest predicted point (n,) of each sample, and whether it is near (n,).
-
-    Parameters
-    ----------
-    position_m : (n, 3)
-        East, north, up of the samples; a sample with a NaN is near no point.
-    points_m : (points, 3)
-    reach_m : float
-        Largest distance of a near point.
-    nose_deg : ((n,), (points,)), optional
-        Headings of samples and points. They are used only if all points and at least one sample have one.
-
-    Returns
-    -------
-    index : (n,) int
-    near : (n,) bool
-    """
-    from scipy.spatial import cKDTree
-
-    samples, points = position_m / reach_m, points_m / reach_m
-    if nose_deg is not None and np.isfinite(nose_deg[0]).any() and np.isfinite(nose_deg[1]).all():
-        apart = 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0)
-        samples, points = (
-            np.column_stack([place, np.sin(np.radians(nose)) / apart, np.cos(np.radians(nose)) / apart])
-            for place, nose in zip((samples, points), nose_deg, strict=True)
-        )
-    known = np.asarray(np.isfinite(samples).all(axis=1))
-    index = np.asarray(cKDTree(points).query(np.where(known[:, None], samples, 0.0))[1])
-    away = samples - points[index]
-    return index, known & (np.linalg.norm(away[:, :3], axis=1) <= 1.0) & (np.linalg.norm(away[:, 3:], axis=1) <= 1.0)
 
 
 def measured_thresholds(measured_db: FloatArray, *, ratio: bool) -> tuple[float, ...]:

@@ -29,7 +29,7 @@ from ..common.text import counted
 from ..common.units import FOOT_M, AnyArray, BoolArray, FloatArray, db_from_power
 from ..common.yamlfile import parse_yaml
 from ..compare import referee
-from ..compare.level import detection_floor_db, nearest_in_time
+from ..compare.level import detection_floor_db, nearest_in_time, nearest_points
 from ..compare.rank import MAX_RANK, compare_ranks
 from ..compare.receiver import score_forecast
 from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
@@ -629,9 +629,7 @@ def predicted_at(
         near = np.asarray(apart / np.timedelta64(1, "s") <= most_s)
     else:
         nose_deg = None if heading_deg is None else (heading_deg, part["yaw_deg"].to_numpy(np.float64))
-        index, near = referee.nearest_points(
-            position_m, part[list(_PLACE)].to_numpy(np.float64), given.near_m, nose_deg
-        )
+        index, near = nearest_points(position_m, part[list(_PLACE)].to_numpy(np.float64), given.near_m, nose_deg)
     return {name: np.where(near, part[name].to_numpy(np.float64)[index], np.nan) for name in names}, near
 
 
@@ -683,7 +681,7 @@ def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightRes
         return None
     flown = np.vstack([s.position_m[np.isfinite(s.position_m).all(axis=1)] for s in result.series])
     points, flat = given.table[list(_PLACE)].dropna().to_numpy(), np.array([1.0, 1.0, 0.0])
-    index, near = referee.nearest_points(flown * flat, points * flat, given.near_m)
+    index, near = nearest_points(flown * flat, points * flat, given.near_m)
     apart_m = float(np.median((points[index] - flown)[near, 2])) if near.any() else 0.0
     datum = (
         f"another height datum: the predicted positions are {abs(apart_m):.0f} m "
@@ -692,7 +690,7 @@ def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightRes
     )
     ground = data.site.takeoff_ground_m * (1.0 - flat)
     corrected = {datum: points - apart_m * (1.0 - flat), "heights in feet": ground + (points - ground) * [1, 1, FOOT_M]}
-    shares = {cause: referee.nearest_points(flown, at, given.near_m)[1].mean() for cause, at in corrected.items()}
+    shares = {cause: nearest_points(flown, at, given.near_m)[1].mean() for cause, at in corrected.items()}
     cause = max(corrected, key=shares.__getitem__)
     return cause if shares[cause] > 0.5 else None
 

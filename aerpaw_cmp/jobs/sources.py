@@ -21,7 +21,7 @@ from ..common.text import counted
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import BIN_S, Correction, Observed, Predictor, between_blocks_db, by_degree
 from ..compare.gains import NO_SPREAD, LinkSamples, LostLock, Spread, fading_of, link_directions
-from ..compare.level import DetectionForecast
+from ..compare.level import DetectionForecast, nearest_points
 from ..flight.data import FAR_M, FlightData, load_data, nearest_m
 from ..flight.drafting.proposals import LearnedLink, latest_learned_links
 from ..flight.gains import flight_of, load_with_learned, pair_db
@@ -628,8 +628,6 @@ class Prior:
 
 def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:
     """Return true for targets (n,) farther than :data:`_HULL_M` or :data:`_HULL_UP_M` from every sample."""
-    from scipy.spatial import cKDTree
-
     scaled = np.array([_HULL_M, _HULL_M, _HULL_UP_M])
     places = np.concatenate([s.position_m for s in flown])
-    return np.asarray(cKDTree(places / scaled).query(position_m / scaled, distance_upper_bound=1.0)[0] > 1.0)
+    return ~nearest_points(position_m / scaled, places / scaled, 1.0)[1]

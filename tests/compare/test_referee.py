@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.level import detection_floor_db
+from aerpaw_cmp.compare.level import detection_floor_db, nearest_points
 from aerpaw_cmp.compare.referee import (
     level_card,
     measured_thresholds,
-    nearest_points,
 )
 from aerpaw_cmp.compare.statistics import paired_difference
 

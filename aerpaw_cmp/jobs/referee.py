@@ -371,9 +371,8 @@ def _times(given: pd.DataFrame) -> Any:
 
 def _places(given: pd.DataFrame, site: Site) -> AnyArray:
     """Return east, north, up (n, 3) in the site frame [m]. NaN if there are no columns of positions."""
-    place, (latitude, longitude, height) = (
-        np.stack([_numbers(given[name]) for name in names]) for names in (_PLACE, _GEOGRAPHIC)
-    )
+    place, geographic = (given[list(names)].apply(_numbers).to_numpy().T for names in (_PLACE, _GEOGRAPHIC))
+    latitude, longitude, height = geographic
     cause = "map coordinates (UTM) instead of metres from the origin"
     if np.isfinite(latitude).any():
         place = np.stack([*site.frame.to_local(latitude, longitude), height + site.takeoff_ground_m])

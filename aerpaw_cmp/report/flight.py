@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -330,11 +329,9 @@ def _exceedance_table(name: str, series: Iterable[tuple[str, Mapping[str, Any]]]
         columns={"Tower, channel": HEAD, "Threshold [dB]": 1, "Measured": SHARE, "Prediction": SHARE,
                  "Ray tracing": SHARE},
         rows=[
-            (link, x["threshold_db"], x["measured"], x["predicted"], mine and mine["predicted"])
-            for link, entry in series
-            for x, mine in zip_longest(
-                *(entry["cards"].get(key, {}).get("exceedance", ()) for key in (name, OURS))
-            )
+            (link, x["threshold_db"], x["measured"], x["predicted"], mine and mine["exceedance"][k]["predicted"])
+            for link, entry in series for mine in [entry["cards"].get(OURS)]
+            for k, x in enumerate(entry["cards"][name]["exceedance"])
         ], look="tall",
     )  # fmt: skip
 

@@ -61,7 +61,7 @@ from ..propagation.replay import Replay, replay
 from ..report import maps as page
 from ..report.prediction import outside_share
 from ..site.site import Site
-from ..site.siteyaml import inputs_of_site, load_site, place_of, site_model
+from ..site.siteyaml import coverage_of, inputs_of_site, load_site
 from .predict import CorrectedMaps
 from .tasks import code_digest
 from .workers import InProcess, Lost, Workers
@@ -191,12 +191,13 @@ def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -
     MapSettings
     """
     given = {name: value for name, value in chosen.items() if value is not None}
-    stated = site_model(site).coverage.model_dump(exclude_none=True)
+    coverage, file, line = coverage_of(site)
+    stated = coverage.model_dump(exclude_none=True)
     carrier = {"carrier_hz": 1e9 * stated.pop("carrier_ghz")} if "carrier_ghz" in stated else {}
     options = {item.name: given.pop(item.name) for item in fields(LinkBudget) if item.name in given}
     if {"threshold_dbm", "threshold_snr_db"} & set(options):
         stated = {name: value for name, value in stated.items() if not name.startswith("threshold")}
-    with nullcontext() if options else about_file(*place_of(site, "coverage")):
+    with nullcontext() if options else about_file(file, line):
         budget = LinkBudget(**stated | options)
     return MapSettings(budget=budget, **(QUICK if quick else {}) | carrier | given)
 

@@ -369,10 +369,10 @@ def site_model(name_or_path: str | Path) -> SiteModel:
     return _find(name_or_path)[1]
 
 
-def place_of(name_or_path: str | Path, *location: Any) -> tuple[str, int | None]:
-    """Return the file of a site, and the line of one of its keys."""
-    path, _, line_of = _find(name_or_path)
-    return path, line_of(location)
+def coverage_of(name_or_path: str | Path) -> tuple[CoverageModel, str, int | None]:
+    """Return the settings under ``coverage`` of a site, and the file and the line of this key."""
+    path, model, line_of = _find(name_or_path)
+    return model.coverage, path, line_of(("coverage",))
 
 
 def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:

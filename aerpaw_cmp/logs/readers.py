@@ -315,6 +315,8 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
         for what, forms in dictionary.HINTS.items()
     } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)] or levels}
     fits["rss_db"].sort(key=lambda name: dictionary.without_unit(name)[1] != "dbm")
+    if fits["time"] and {"roll_deg", "pitch_deg"} <= {what.quantity.name for what in known if what}:
+        return "angles without positions: write them into the table of the positions, at the same times"
     if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in dictionary.HINTS)):
         lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
         return f"a table of another kind; no column looks like {lacking}"

@@ -62,12 +62,7 @@ def parts(
     several = [i for i in columns if 1 < len({texts[i][row] for row in picked}) <= _MOST_PARTS]
     base = ["\t".join(row) for row in zip(*(texts[i] for i in several), strict=True)]
     several += dividing_columns({i: texts[i] for i in marks}, filled, base)
-    for i in several:
-        empty = [texts[i][row] for row in picked].count("")
-        if empty > _MOSTLY * len(picked):
-            text = f"is empty in {counted(empty, 'row')}, which become a separate series"
-            text = f"{text}: are its cells merged? If so, fill them"
-            rows.warnings.append(f"column {sheet.names[i]!r} {text}")
+    rows.warnings += filter(None, (mostly_empty(sheet, i, filled) for i in several))
     if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
         shown = ", ".join(map(repr, unknown))
         rows.warnings.append(f"column {shown} distinguishes the rows: each of its values is a series")
@@ -87,6 +82,16 @@ def parts(
         written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if text}
         label = "_".join(_label(name, text) for name, text in written.items())
         yield label, replace(rows.part(where), about=rows.about | attributes_of(alone | written)), sheet.part(where)
+
+
+def mostly_empty(sheet: _sheet.Sheet, column: int, where: BoolArray) -> str:
+    """Return a sentence about a column of identities that is empty in most rows of a mask, but not in all."""
+    texts = np.array(_named(sheet, column))[where]
+    empty = int((texts == "").sum())
+    if not _MOSTLY * len(texts) < empty < len(texts):
+        return ""
+    text = f"is empty in {counted(empty, 'row')}, which become a separate series"
+    return f"column {sheet.names[column]!r} {text}: are its cells merged, or written on changes only? If so, fill them"
 
 
 def _values(texts: _Texts) -> dict[int, set[str]]:
@@ -289,9 +294,10 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     meaning = sheet.meanings[column]
     zero = meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(_COUNTED)
     texts = sheet.texts(column)
-    # 'lw1' and 'LW1' are one tower
-    spelling = {text.casefold(): text for text in reversed(texts)}
-    named = {text: spelling[text.casefold()] if _is_identity(text, zero=zero) else "" for text in {*texts}}
+    # 'lw1', 'LW1' and 'LW-1' are one tower
+    plain = {text: re.sub(r"(?<=[^\W\d])[-_ ](?=\d)", "", text.casefold()) for text in {*texts}}
+    spelling = {plain[text]: text for text in reversed(texts)}
+    named = {text: spelling[plain[text]] if _is_identity(text, zero=zero) else "" for text in {*texts}}
     return [named[text] for text in texts]
 
 

@@ -184,8 +184,11 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     height, time_s = sheet.numbers(column), (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
     home = next((i for i, words in enumerate(sheet.plain) if _OF_HOME.fullmatch(words)), None)
     if datum in ("sea level", "unknown") and home is not None and (is_set := sheet.numbers(home) > UNSET_M).any():
-        sheet.used.add(home)
-        return "take-off", above_home(rows, time_s, height, time_s[is_set], sheet.numbers(home)[is_set])
+        home_m, lowest_m = sheet.numbers(home)[is_set], np.nanmin(height, initial=np.inf)
+        # heights of an unknown datum may count from home already
+        if datum == "sea level" or (lowest_m > home_m.min() - _REST_M and lowest_m > home_m.min() / 2):
+            sheet.used.add(home)
+            return "take-off", above_home(rows, time_s, height, time_s[is_set], home_m)
     if datum != "take-off":
         return datum, height
     for i, what in enumerate(sheet.meanings):

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import NEAR_DEG
 from aerpaw_cmp.readers import OtherLines, ReadOptions, RejectedLine, Rows, built, counted, dictionary, instants_of
@@ -140,6 +140,7 @@ _HEMISPHERE = re.compile(r"[^A-Za-z]([NSEW])[\])]?\s*$")
 _OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", re.IGNORECASE)
 # The radio access of a cell as programs write it.
 _RAT = re.compile(r"(?i)(lte|nr|[2345]g|gsm|umts|wcdma|e-?utran?)([ _-]?(a|nr|nsa|sa|lte|fdd|tdd|e-?utran?))?")
+_ANY_RAT = re.compile(r"(?i)lte|nr|\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|neigh|serv|detect|^\s*$")
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that need no conversion.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
@@ -210,6 +211,13 @@ class Sheet:
         """The meaning of each column."""
         said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
         known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
+        for i, what in enumerate(known):  # a column such as 'radio' may name receivers
+            if (
+                what
+                and what.quantity.name == "technology"
+                and not any(_ANY_RAT.search(row[i]) for row in self.cells[:200])
+            ):
+                known[i] = None
         if not any(what and what.quantity.name == "technology" for what in known):
             of_rats = dictionary.meaning("technology")
             known = [of_rats if what is None and self._names_rats(i) else what for i, what in enumerate(known)]
@@ -832,9 +840,17 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
     if not _is_dated(sheet, column):
         column = next((i for i in ranked if _is_dated(sheet, i)), column)
     texts = pd.Series(sheet.texts(column), dtype=object)
-    if options is None or not (texts == texts.shift()).any():
+    if options is None:
         return column
     rest = [i for i in ranked if i != column]
+    if not (texts == texts.shift()).any():
+        own = _instants(sheet, column, options)
+        for i in rest if len(own) else ():
+            apart = _instants(sheet, i, options) - own
+            if abs(apart_s := float(np.median(apart) / np.timedelta64(1, "s"))) > _APART_S:
+                text = f"{abs(apart_s):.0f} s {'behind' if apart_s < 0 else 'ahead of'} {sheet.names[column]!r}"
+                sheet.notes[i] = f"column {sheet.names[i]!r} is {text}, which is used: which clock is right?"
+        return column
     moving = next((i for i in rest if _moves_on(sheet, i, texts, options)), column)
     if moving != column:
         text = f"column {sheet.names[column]!r} stops while {sheet.names[moving]!r} advances: the latter is used"
@@ -854,16 +870,26 @@ _STANDS_S = 2.0
 
 def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: ReadOptions) -> bool:
     """Check whether a column of times advances while another column shows one time."""
+    run = (standing != standing.shift()).cumsum().to_numpy()
+    time = pd.Series(_instants(sheet, column, options, dated=standing.nunique() > 1))
+    spans = time.groupby(run).agg(["min", "max"])
+    return bool(((spans["max"] - spans["min"]).dt.total_seconds() > _STANDS_S).any())
+
+
+# Two clocks of one table are reported if they differ by more than this [s].
+_APART_S = 2.0
+
+
+def _instants(sheet: Sheet, column: int, options: ReadOptions, *, dated: bool = True) -> AnyArray:
+    """Return a column of times in UTC, all NaT if it cannot be read, or if it must be dated and is not."""
+    none = np.full(len(sheet), np.datetime64("NaT", "ns"))
     try:
         clock, cells, _ = _times(sheet, column, options, mapped=False)
         _, instants, valid = instants_of(cells, options, clock=clock, reader="the table")
     except (InputError, UsageError):
-        return False
-    if (clock.startswith("relative") and standing.nunique() > 1 and not options.time_origin) or not valid.all():
-        return False
-    run = (standing != standing.shift()).cumsum().to_numpy()
-    spans = pd.Series(instants.time).groupby(run).agg(["min", "max"])
-    return bool(((spans["max"] - spans["min"]).dt.total_seconds() > _STANDS_S).any())
+        return none
+    undated = clock.startswith("relative") and dated and not options.time_origin
+    return none if undated or not valid.all() else instants.time
 
 
 def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:

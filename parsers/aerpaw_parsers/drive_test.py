@@ -107,7 +107,9 @@ class _Cell:
 
 
 _IDENTITY = ("pci", "arfcn")
-# Prefixes of places with a secondary carrier.
+# Columns are separate series if they repeat a cell of their row in more than this share of the rows.
+_TWICE = 0.3
+# Prefixes of places with a secondary carrier, which always is a cell of its own.
 _SECONDARY = ("scell", "secondary")
 # Prefixes of devices and SIMs, whose cells are separate series.
 _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
@@ -221,7 +223,7 @@ def _readings(
         about = {
             "row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle,
             "more": more if cell.place == "serving" else "", "mark": _identity.labels(sheet, cell.marks, known),
-            "carrier": cell.place.replace(" ", "_") if cell.place.startswith(_SECONDARY) else "",
+            "carrier": "" if cell.place.startswith(("serving", "n")) else cell.place.replace(" ", "_"),
             "column": "" if cell.place == "serving" and not cell.marks else cell.place.replace(" ", "_"),
         }  # fmt: skip
         # an absent leg or neighbour is not a reading
@@ -236,9 +238,12 @@ def _marked(readings: pd.DataFrame) -> pd.DataFrame:
     Next to a PCI, such an identity counts only if one PCI has two of them.
     """
     known, marks = readings["pci"].notna(), readings["mark"]
-    # carriers of one mast often have one PCI
-    twice = readings.assign(arfcn=readings["arfcn"].fillna(-1)).duplicated(["row", "rat", "pci", "arfcn"], keep=False)
-    carriers = readings["carrier"].where(readings["carrier"].isin(readings["carrier"][twice & known]), "")
+    # carriers of one mast often have one PCI, and two phones one cell
+    cell = ["row", "rat", "pci", "arfcn", "mark"]
+    twice = readings.assign(arfcn=readings["arfcn"].fillna(-1)).duplicated(cell, keep=False)
+    share = (twice & known).groupby(readings["carrier"]).mean()
+    apart = share[share.gt(np.where(share.index.str.startswith(_SECONDARY), 0.0, _TWICE))].index
+    carriers = readings["carrier"].where(readings["carrier"].isin(apart), "")
     both = (known & marks.ne("")).to_numpy()
     if not _identity.dividing_columns({0: marks.tolist()}, both, readings["pci"].astype(str).tolist()):
         marks = marks.where(~known, "")
@@ -425,7 +430,9 @@ def _short(sheet: _sheet.Sheet, column: int) -> str:
 def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: list[int]) -> None:
     """Report which of several columns of a cell's level was read, and how the others were read."""
     for cell in cells:
-        level = sheet.names[cell.columns["rsrp_dbm"]]
+        level, known = sheet.names[cell.columns["rsrp_dbm"]], np.isfinite(sheet.numbers(cell.columns["rsrp_dbm"]))
+        if "pci" in cell.columns and (text := _identity.mostly_empty(sheet, cell.columns["pci"], known)):
+            rows.warnings.append(text)
         of_cell = [i for i in others if (m := sheet.meanings[i]) and (m.rat, m.place) == (cell.rat, cell.place)]
         means = [i for i in of_cell if _part(sheet, i) == "mean"]
         if _part(sheet, cell.columns["rsrp_dbm"]) == "mean":

@@ -189,6 +189,8 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         table("elapsed_time,utc_stamp,node,raw_dbfs,cal_dbm", f"{{i}},{EPOCH},A,{{l}},{{l}}"), InputError,
         "--map 'utc_stamp'=time --map 'cal_dbm'=rss_db$"),
     "a table in another encoding": ("time,h\udcf6he\n1,2\n", InputError, "another encoding than UTF-8"),
+    "angles without positions": (
+        table("time,roll,pitch,yaw", EPOCH + ",1.5,2.5,90"), InputError, "angles without positions"),
     "levels in lists": (
         table("time,pci,rsrp", EPOCH + ',5,"[{l}, -99]"'), InputError, "found no record"),
     "a local position of PX4": (

@@ -243,6 +243,25 @@ def test_levels_in_decibels_without_a_reference_are_not_those_of_another_unit(un
     capsys.readouterr()
 
 
+def test_the_unit_of_levels_does_not_decide_about_antennas(tmp_path, capsys) -> None:
+    """Half a minute of levels has little evidence. It must be the same in the learned unit and in another."""
+
+    def short(folder: Path) -> None:
+        level_tables(folder, unit)
+        for table in folder.glob("meter*.csv"):
+            table.write_text("".join(table.read_text().splitlines(keepends=True)[:151]))
+
+    found = []
+    for unit in ("dBm", "dB"):
+        (tmp_path / unit).mkdir()
+        draft, content = drafted(short, tmp_path / unit, known_site(tmp_path / unit))
+        names = sorted(content.get("antennas", {}).values())
+        found.append((names, re.findall(r"odds \d+:1 against an unknown gain", draft.read_text())))
+    assert found[0] == found[1]
+    assert len(found[0][0]) == 3
+    capsys.readouterr()
+
+
 @pytest.mark.parametrize("names", [("a/", "b/"), ("left_", "right_"), ("LW1/USRP1/", "LW1/USRP2/")])
 def test_each_of_two_receivers_has_the_lock_of_its_own_quality(names, tmp_path, capsys) -> None:
     lost = np.arange(len(TIMES)) % 900 < 300

@@ -652,10 +652,10 @@ def _antennas_for(
         for item in known:
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, bands[0]):
                 continue
-            named_odds = _named_odds(data, series, item, receivers)
             # antennas that do not predict other flights are not offered to a receiver with another unit
-            if named_odds < 0.0 and not item.airframe_is_general:
+            if _unit_odds(series, item) < 0.0 and not item.airframe_is_general:
                 continue
+            named_odds = _named_odds(data, series, item, receivers)
             # antennas with a different name must also fit better than any airframe with an unknown antenna
             alternative = most_alone if named_odds <= 0.0 else -math.inf
             odds = evidence.of_link(number, item.moments, alternative).with_prior(named_odds)
@@ -780,9 +780,9 @@ def _airframe_for(
     )
 
 
-# Prior log odds of antennas of both ends, with the same names of tower and channel or the same receiver, and with
-# levels in another unit, which means another receiver. Levels of field flights add 13 and more, so they can outweigh
-# equal names. Those of a short or smooth flight cannot.
+# Prior log odds of antennas of both ends, with the same names of tower and channel or the same receiver, and those of a
+# receiver with levels in another unit. Levels of field flights add 13 and more, so they can outweigh equal names. Those
+# of a short or smooth flight cannot. The unit belongs to the receiver, so it says nothing about the antennas.
 _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 
 # Prior log odds that known antennas are mounted as before, and not rotated by a quarter turn or more.
@@ -795,11 +795,11 @@ def _named_odds(data: FlightData, series: RssSeries, item: LearnedLink, receiver
     if receiver in receivers:
         return _SAME_NAME if receiver == item.receiver else -math.inf
     same = (series.tower, series.channel) == (item.series.tower, item.series.channel)
-    return (_SAME_NAME if same else 0.0) + _unit_odds(series, item)
+    return _SAME_NAME if same else 0.0
 
 
 def _unit_odds(series: RssSeries, item: LearnedLink) -> float:
-    """Return the log odds that the unit of levels gives to learned levels. A level in dB can have any reference."""
+    """Return the log odds that the unit of levels gives to a receiver. A level in dB can have any reference."""
     any_reference = series.unit == "dB" and series.channel.lower() not in RATIOS
     same = item.series.level is None or any_reference or item.level.unit == series.unit
     return 0.0 if same else _OTHER_UNIT

@@ -28,7 +28,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.gaussian import Factor
 from ..common.units import FloatArray, IntArray, spread_out
-from .gains import BAND, GainFit, GainModel, LinkSamples, fit_gain
+from .gains import USUAL_OFFSET_DB, GainFit, GainModel, LinkSamples, fit_gain, offset_sd_db
 
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
@@ -70,7 +70,7 @@ class FieldModel:
     length_m: float = 50.0
     height_m: float = 30.0
     turn: float = 0.7
-    offset_sd_db: float = 1.5
+    offset_sd_db: float = USUAL_OFFSET_DB
     drift_sd_db: float = 1.5
     drift_s: float = 60.0
     noise_sd_db: float = 1.5
@@ -331,24 +331,12 @@ def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
 
 
 def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], usual_db: float) -> float:
-    """Return the standard deviation of a normal distribution with the 90 % band of the offset of a new flight [dB].
-
-    The standard deviation between flights is integrated over its posterior distribution, because the differences of
-    few flights hardly determine it. The prior is log normal with the median ``usual_db`` and a factor of three. It does
-    not exclude equal offsets, which flights with the same devices can have.
-    """
-    from scipy.special import ndtr, ndtri
-
+    """Return :func:`.offset_sd_db` for the means of flights on all channels."""
     squares, count = 0.0, 0
     for rows, value in channels:
         means = np.array([value[rows.flight == code].mean() for code in np.unique(rows.flight)])
         squares, count = squares + float(((means - means.mean()) ** 2).sum()), count + len(means) - 1
-    z, share = np.linspace(-3.0, 3.0, 61), 0.5 + 0.5 * BAND
-    sd_db = usual_db * 3.0**z
-    log = -0.5 * z**2 - count * np.log(sd_db) - 0.5 * squares / sd_db**2
-    weight = np.exp(log - log.max())
-    inside = ndtr(ndtri(share) * sd_db[:, None] / sd_db) @ weight / weight.sum()
-    return float(np.interp(share, inside, sd_db))
+    return offset_sd_db(squares, count, usual_db)
 
 
 def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:

@@ -19,7 +19,7 @@ from ..common.gaussian import determining, gaussian_kernel
 from ..common.units import spread_out
 from ..common.yamlfile import dump_yaml
 from ..compare.calibration import Score, cruise_height_m, mean_rmse
-from ..compare.gains import Frame, Spread, directed, student_factor
+from ..compare.gains import Frame, Spread, directed, offset_sd_db
 from ..flight.data import FlightData, RssSeries, quantity_of
 from ..flight.training import flight_logs, marks_of
 from ..logs.records import has_wall_clock
@@ -388,11 +388,6 @@ def _learned_series(
 # Number of samples from which the mean standard deviation of a series is computed.
 _SD_SAMPLES = 200
 
-# Prior SD of the offset between flights [dB], with the weight of two flights. It is a guess, because it cannot be
-# learned: estimates from any three of dataset 12, LTE, AFAR and NR range from 1.0 dB (without AFAR) to 2.8 dB (without
-# dataset 12).
-_OFFSET_SD_DB = 1.5
-
 
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
     """Return the mean level of the flights relative to the written antennas, with its error on held-out flights."""
@@ -408,10 +403,10 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
     ]
     n = max(len(squares), 1)
     # the difference from the mean of the n - 1 other flights is n / (n - 1) times that from the mean of all n
-    variance_db2 = (2.0 * _OFFSET_SD_DB**2 + (1.0 - 1.0 / n) ** 2 * sum(squares)) / (n + 1.0)
+    between_db = offset_sd_db((1.0 - 1.0 / n) ** 2 * sum(squares), n - 1)
     return LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
-        sd_db=round(student_factor(n) * math.sqrt((1.0 + 1.0 / n) * variance_db2), 2),
+        sd_db=round(math.sqrt(1.0 + 1.0 / n) * between_db, 2),
         transmit_power_dbm=sent,
         unit=series.unit,
     )

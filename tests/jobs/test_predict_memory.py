@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.compare.gains import Spread
+from aerpaw_cmp.compare.gains import Spread, offset_sd_db
 from aerpaw_cmp.jobs import predict
 from aerpaw_cmp.jobs.sources import Memory, TargetOptions, named_flights
 from aerpaw_cmp.site.learned import (
@@ -168,8 +168,8 @@ def test_a_flight_is_predicted_before_it_from_the_memory_alone(flown: Path) -> N
     """Known offsets are added to the measurement: 12 and 9 dB are stored, 4 dB are flown."""
     level = read_learned(flown / "mine.yaml").entries["planted"].series[0].level
     assert level is not None
-    # t with 3 degrees of freedom: one difference of 3 dB, and a prior of 1.5 dB as two more; 90 % within 2.353 scales
-    assert level.sd_db == pytest.approx(2.353 / 1.645 * np.sqrt(1.5 * (2 * 1.5**2 + 3.0**2 / 2) / 3), abs=0.4)
+    # two flights whose offsets differ by 3 dB; a new offset differs from their mean by the SD times sqrt(1 + 1 / 2)
+    assert level.sd_db == pytest.approx(np.sqrt(1.5) * offset_sd_db(3.0**2 / 2, 1), abs=0.4)
     out, asked = flown / "before", ["--site", str(flown / "mine.yaml")]
     assert main(["predict", str(flown / "aside.yaml"), *asked, "-o", str(out)]) == 0
     assert main(["report", str(flown / "aside.yaml"), "--against", str(out), "--audit", "none", "-o",

@@ -419,7 +419,15 @@ def unit_of(written: str) -> str:
     """Return the unit to which a written unit is converted, an unknown unit as written, else an empty text."""
     written = _scale(written)[1]
     known = UNITS.get(written)
-    return known[0] if known else "deg" if written in _DDMM else written if _A_UNIT.fullmatch(written) else ""
+    return (
+        known[0]
+        if known
+        else "deg"
+        if written in _DDMM
+        else written
+        if written in _FACTORS or _A_UNIT.fullmatch(written)
+        else ""
+    )
 
 
 def converted(values: FloatArray, written: str) -> FloatArray:

@@ -34,11 +34,8 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.units import AnyArray
 
-try:
-    from lzma import LZMAError
-except ImportError:  # some Python builds do not have the module
-    LZMAError = OSError  # type: ignore[assignment,misc]
-
+# zipfile imports lzma, which some Python builds do not have
+_LZMA_ERROR: type[Exception] = getattr(getattr(zipfile, "lzma", None), "LZMAError", OSError)
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
 _MODULES = {"gzip": "gzip", "bzip2": "bz2", "xz": "lzma"}
 _BLOCKS = {b"%d1AY&SY" % level for level in range(1, 10)}
@@ -90,7 +87,7 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
     except EOFError as error:
         raise InputError(f"the {name} file ends too early", cause="a truncated download", path=path) from error
     # the header of an xz file may ask for more memory than there is
-    except (OSError, ValueError, zlib.error, LZMAError, MemoryError) as error:
+    except (OSError, ValueError, zlib.error, _LZMA_ERROR, MemoryError) as error:
         raise InputError(f"a damaged {name} file ({error})", cause="a truncated download", path=path) from error
 
 
@@ -134,7 +131,7 @@ _FREE_BYTES = 2**28
 _RATIO = 1200
 # Errors of Python's libraries for damaged archives, ValueError for a directory that begins before the file does.
 _DAMAGE = (
-    zipfile.BadZipFile, zlib.error, LZMAError, struct.error, EOFError, OSError, ValueError, IndexError,
+    zipfile.BadZipFile, zlib.error, _LZMA_ERROR, struct.error, EOFError, OSError, ValueError, IndexError,
     OverflowError, NotImplementedError,
 )  # fmt: skip
 

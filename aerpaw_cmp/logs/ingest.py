@@ -523,8 +523,6 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
 ROLLOVER_DAYS = 7 * 1024
 # Start of the first LTE networks. Earlier dates of logs are wrong.
 _PLAUSIBLE_FROM = datetime(2009, 12, 1)
-# Relative times after this date are not the duration of a log, but count from another epoch.
-_RELATIVE_UNTIL = datetime(1979, 1, 1)
 # Dates after this are wrong: counts of LabVIEW (from 1904) and NTP (from 1900), read as Unix time, are after 2080.
 _FUTURE = datetime(2050, 1, 1)
 
@@ -542,16 +540,27 @@ def _later(result: ReadResult, rollovers: int) -> ReadResult:
         text = f"{counted(rollovers, 'rollover')} of the GPS week number: {days} days were added to the times"
     elif first >= _FUTURE:
         text = f"the dates begin on {first:%Y-%m-%d}, in the future: do the times count from 1904 or 1900, not 1970?"
-    elif _RELATIVE_UNTIL < first < _PLAUSIBLE_FROM and streams[0].attributes.get("clock") == "relative":
-        text = f"the times begin on {first:%Y-%m-%d} if they count from 1970: do they count from 2001 or 1980?"
     elif _PLAUSIBLE_FROM - timedelta(days=ROLLOVER_DAYS) < first < _PLAUSIBLE_FROM:
-        text = (
-            f"the dates begin on {first:%Y-%m-%d}: if the week number of the GPS receiver rolled over, "
-            "'gps_rollovers: 1' next to the log in flight.yaml adds 1 024 weeks"
-        )
+        way = "'gps_rollovers: 1' next to the log in flight.yaml adds 1 024 weeks"
+        rolled = f"if the week number of the GPS receiver rolled over, {way}"
+        relative = streams[0].attributes.get("clock") == "relative"
+        text = f"the dates begin on {first:%Y-%m-%d}: {'do they count from 2001 or 1980?' if relative else rolled}"
     else:
         return result
     return replace(result, streams=streams, warnings=(*result.warnings, text))
+
+
+def _inside(
+    place: Path, options: _OptionsFor | None, chosen: Reader | None, before: Sequence[IngestedFile]
+) -> _Found:  # fmt: skip
+    """Read a file of a folder: a log, an archive, or those logs of a flight file that were not read before."""
+    if not _is_flight_file(place):
+        if _is_archive(place):
+            return _archive(place, options, chosen)
+        return [read_file(place, options=options, reader=chosen)], []
+    known = {file.sha256 for file in before}
+    inside = [file for file in _flight_file(place, chosen) if file.sha256 not in known]
+    return inside, [] if inside else [Skipped(str(place), "a flight file without further logs")]
 
 
 def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
@@ -569,18 +578,12 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
             skipped.append(Skipped(str(place), what))
             continue
         try:
-            if _is_flight_file(place):
-                known = {file.sha256 for file in files}
-                inside = [file for file in _flight_file(place, chosen) if file.sha256 not in known]
-                below = [] if inside else [Skipped(str(place), "a flight file without further logs")]
-            elif _is_archive(place):
-                inside, below = _archive(place, options, chosen)
-            else:
-                inside, below = [read_file(place, options=options, reader=chosen)], []
-            files, skipped = files + inside, skipped + below
+            inside, below = _inside(place, options, chosen, files)
         except AerpawCmpError as error:
             meta = place.with_suffix(".sigmf-meta")
-            skipped.append(Skipped.of(place, {meta.name} if meta.exists() else (), error))
+            inside, below = [], [Skipped.of(place, {meta.name} if meta.exists() else (), error)]
+        files += inside
+        skipped += below
     return files, skipped
 
 

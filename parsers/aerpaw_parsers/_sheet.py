@@ -211,14 +211,11 @@ class Sheet:
         """The meaning of each column."""
         said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
         known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
-        for i, what in enumerate(known):  # a column such as 'radio' may name receivers
-            if (
-                what
-                and what.quantity.name == "technology"
-                and not any(_ANY_RAT.search(row[i]) for row in self.cells[:200])
-            ):
-                known[i] = None
-        if not any(what and what.quantity.name == "technology" for what in known):
+        rats = {i for i, what in enumerate(known) if what and what.quantity.name == "technology"}
+        # a column such as 'radio' may name receivers
+        unlike = {i for i in rats if not any(_ANY_RAT.search(row[i]) for row in self.cells[:200])}
+        known = [None if i in unlike else what for i, what in enumerate(known)]
+        if rats == unlike:
             of_rats = dictionary.meaning("technology")
             known = [of_rats if what is None and self._names_rats(i) else what for i, what in enumerate(known)]
         return dictionary.with_places(zip(self.plain, known, strict=True))

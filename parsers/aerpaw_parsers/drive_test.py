@@ -362,9 +362,8 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         owned.setdefault((owner, "", cell.quantity, unit), []).append(cell)
         for port in cell.ports:  # the same cell under another name
             of_port = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
-            owned.setdefault((owner, _short(sheet, port), cell.quantity, unit), []).append(
-                replace(cell, columns=of_port)
-            )
+            key = (owner, _short(sheet, port), cell.quantity, unit)
+            owned.setdefault(key, []).append(replace(cell, columns=of_port))
     several = len({owner for owner, *_ in owned}) > 1
     levels = [
         _renamed(stream, "_".join(word for word in (owner if several else "", port) if word))

@@ -303,10 +303,10 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         rows=[list(node.values()) for node in verdict["nodes"]],
     )
     ranks = Table(
-        caption="Ranks on the same samples. A log score [nat] is better if it is lower; that of the mean probabilities "
-        "is beside it.",
+        caption="Ranks on the same samples. A log score [nat] is better if it is lower; the last column is that of "
+        "the mean probabilities.",
         columns={"Tower": HEAD, "Model": TEXT, "Samples": 0, "Kappa": 2, "Total variation": 3, "Agreement": SHARE,
-                 "Log score": 3, "Of the mean": 3},
+                 "Log score": 3, "Log score of the mean": 3},
         rows=[
             (tower, model, entry["matched"], score["kappa"], score["total_variation"], score["agreement"],
              *(entry[key] if model == name else None for key in ("log_score", "constant_log_score")))

@@ -311,5 +311,5 @@ def test_the_page_states_the_log_score_of_predicted_ranks_beside_their_own_row()
         "rank": {"LW1": {**ranks, "scores": scores}},
     })  # fmt: skip
     (table,) = (table for table in card.tables if table.rows)
-    assert list(table.columns)[-2:] == ["Log score", "Of the mean"]
+    assert list(table.columns)[-2:] == ["Log score", "Log score of the mean"]
     assert [row[-2:] for row in table.rows] == [(1.25, 1.5), (None, None)]

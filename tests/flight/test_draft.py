@@ -199,6 +199,14 @@ def test_the_tower_is_told_by_the_folder_of_the_log(logs: Path) -> None:
     assert "node: LW4}  # which tower?" in text  # a guess
 
 
+def test_a_folder_between_the_tower_and_its_log_does_not_hide_the_tower(logs: Path) -> None:
+    between = logs / "LW2" / "Results"
+    between.mkdir()
+    shutil.move(logs / "LW2/USRP1_power_log.txt", between / "USRP1_power_log.txt")
+    text, _ = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
+    assert "{path: LW2/Results/USRP1_power_log.txt, reader: sounder_log, node: LW2, channel: USRP1}\n" in text
+
+
 def test_a_ratio_is_kept_where_nothing_else_is(logs: Path) -> None:
     shutil.move(logs / "LW1/USRP1_power_log.txt", logs / "LW1/x_quality_log.txt")
     files = ingest([logs / "LW1/x_quality_log.txt", *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)

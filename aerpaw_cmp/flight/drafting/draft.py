@@ -1103,8 +1103,9 @@ def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[s
     if not need:
         return entry, ""
     here = Path(file.path).resolve()
-    # only the names of the file and its folder, because a home folder may have the name of a tower
-    near = named_tower("/".join(here.parts[-2:]), towers)
+    # only the file, its folder and folders below the draft, because a home folder may have the name of a tower
+    below = path if not path.startswith(("/", "..")) else ""
+    near = named_tower("/".join(here.parts[-2:]), towers) or named_tower(below, towers)
     alone = towers[0] if len(towers) == 1 else None
     entry["node"] = near or named_tower(path, towers) or alone or next(iter(towers), "LW1")
     if cells := _cells(need):

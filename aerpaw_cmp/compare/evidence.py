@@ -102,6 +102,8 @@ class LevelEvidence:
     """Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent."""
     others: tuple[LevelEvidence, ...] = ()
     """The other channels of the tower, which step at the same time if a cable or a gain changes, or can be swapped."""
+    step_db: float = 0.0
+    """Smallest difference between two levels of the log: its rounding."""
 
 
 def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
@@ -138,9 +140,18 @@ def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
     at = level == level.min()
     # compare with the next level: if levels are rounded, all are frequent, but the lowest is rarer than the next
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
-    often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level), next_often)
+    # levels that the log repeats are one reading
+    usual_run = 1.0 + 2.0 * np.median(ages(np.arange(len(level)), level)[~at]) if not at.all() else 1.0
+    often = at.sum() >= max(_AT_END * usual_run, _SHARE_AT_END * len(level), next_often)
+    changed["step_db"] = float(np.diff(np.unique(level)).min(initial=np.inf))
     changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
     return LevelEvidence(**changed)  # type: ignore[arg-type]
+
+
+def ages(time_s: AnyArray, level_db: FloatArray) -> FloatArray:
+    """Return for how long each level (n,) of a log was repeated before: the time since the last change."""
+    changed = np.diff(level_db, prepend=np.nan) != 0.0
+    return np.asarray(time_s - np.maximum.accumulate(np.where(changed, time_s, -np.inf)))
 
 
 def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:

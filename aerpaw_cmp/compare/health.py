@@ -14,6 +14,7 @@ import numpy as np
 
 from ..common.units import FloatArray
 from ..site.learned import LearnedHealth, LearnedSeries
+from .evidence import ages
 from .level import floored_fit
 
 # Averaging time [s], and largest number of means. Longer flights are averaged over longer times.
@@ -62,10 +63,7 @@ class HeldOut:
     def longest_run_s(self) -> float:
         """Longest time without any change of the readings [s]."""
         known = np.isfinite(self.measured_db)
-        time_s = self.time_s[known]
-        ends = np.flatnonzero(np.append(np.diff(self.measured_db[known]) != 0.0, True))
-        begins = np.append(0, ends[:-1] + 1)
-        return float((time_s[ends] - time_s[begins]).max(initial=0.0))
+        return float(ages(self.time_s[known], self.measured_db[known]).max(initial=0.0))
 
 
 def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[float]]) -> LearnedHealth:

@@ -25,6 +25,7 @@ from ..common.gaussian import Factor, determining, gaussian_kernel
 from ..common.geodesy import rough_m
 from ..common.jsonable import fields_of
 from ..common.units import AnyArray, BoolArray, FloatArray, Printed
+from ..compare.evidence import ages
 from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 from ..compare.statistics import is_flat
 from ..logs.records import Stream, has_wall_clock
@@ -226,12 +227,11 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     or at the most likely lag of a model. For each lag, the model with the highest likelihood counts. A poor model
     therefore cannot exclude a lag. The best lag must be more likely than a level that does not depend on position at
     all. A shift must also be significant without any fifth of the flight, because one dip, jump of the position or
-    frozen track must not decide.
+    frozen track must not decide. A lag that repeated readings explain is no shift.
     """
     alive = [channel for channel in channels if not channel.flat]  # a constant level contains no information about time
-    if not alive:
-        return _nothing(_FLAT_LEVEL, window_s)
-    models = [name for name in alive[0].along.predicted_db if all(name in c.along.predicted_db for c in alive)]
+    named = [channel.along.predicted_db for channel in alive]
+    models = [name for name in (named[0] if named else ()) if all(name in each for each in named)]
     places = {channel.along.place: channel.along for channel in alive}
     features = {place: along.features() for place, along in places.items()}
     bins = {
@@ -240,7 +240,10 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         if (b := _Bins.of(channel, models, features[channel.along.place], window_s)) is not None
     }
     if not bins:
-        return _nothing(_NO_OVERLAP, window_s)
+        return ClockEstimate(
+            radio_minus_telemetry_s=float("nan"), ci95_s=(-window_s, window_s), verdict=CANNOT_TELL,
+            reason=_NO_OVERLAP if alive else _FLAT_LEVEL, window_s=window_s,
+        )  # fmt: skip
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
     # find likely lags with a guess of the correlation time, then fit the correlation time at these lags
@@ -260,12 +263,28 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     explained = total.max() - sum(b.constant() for b in bins.values())
     if explained < EVIDENCE_NAT + np.log(len(lags)):  # a gain of this size occurs by chance among this number of lags
         return replace(estimate, verdict=CANNOT_TELL, reason=_NO_DEPENDENCE)
-    if estimate.verdict != SHIFTED or _shown_without(bins, parts, estimate.radio_minus_telemetry_s):
+    lag_s, held_s = estimate.radio_minus_telemetry_s, _held_s(alive)
+    held = 0.0 < lag_s <= held_s
+    if estimate.verdict != SHIFTED or (not held and _shown_without(bins, parts, lag_s)):
         return estimate
     low, high = min(estimate.ci95_s[0], 0.0), max(estimate.ci95_s[1], 0.0)
     agree = low >= -_AGREE_S - STAMPS_S and high <= _AGREE_S + STAMPS_S
-    verdict, reason = (OK, "") if agree else (CANNOT_TELL, _ONE_PLACE)
+    verdict, reason = (OK, "") if agree else (CANNOT_TELL, _HELD.format(held_s) if held else _ONE_PLACE)
     return replace(estimate, verdict=verdict, reason=reason, ci95_s=(low, high))
+
+
+def _held_s(channels: Sequence[ClockChannel]) -> float:
+    """Return the age of repeated readings that one reading in ten exceeds [s].
+
+    A repeated reading is late although the clock is right. Readings at a limit of the receiver are not counted.
+    """
+    old_s = [np.zeros(1)]
+    for channel in channels:
+        known = np.isfinite(channel.measured_db)
+        level_db = channel.measured_db[known]
+        inside = (level_db > level_db.min()) & (level_db < level_db.max())
+        old_s.append(ages(channel.time_s[known], level_db)[inside])
+    return float(np.quantile(np.concatenate(old_s), 0.9))
 
 
 def _shown_without(bins: Mapping[str, _Bins], parts: Mapping[str, list[_Parts]], lag_s: float) -> bool:
@@ -286,6 +305,7 @@ def _shown_without(bins: Mapping[str, _Bins], parts: Mapping[str, list[_Parts]],
 _NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
 _FLAT_LEVEL = "the level is constant although the model predicts a change"
 _ONE_PLACE = "only one fifth of the flight supports a clock shift"
+_HELD = "readings are repeated for up to {:.0f} s, so levels are late although the clock may be right"
 _NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 
 
@@ -308,13 +328,6 @@ def _finer(
         order = np.argsort(lags)
         lags, nats = lags[order], nats[..., order]
     return lags, nats
-
-
-def _nothing(reason: str, window_s: float) -> ClockEstimate:
-    return ClockEstimate(
-        radio_minus_telemetry_s=float("nan"), ci95_s=(-window_s, window_s), verdict=CANNOT_TELL, reason=reason,
-        window_s=window_s,
-    )  # fmt: skip
 
 
 def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: float) -> ClockEstimate:

@@ -92,6 +92,18 @@ def test_two_loggers_at_one_tower_have_no_common_clock():
     assert clock.reason.startswith("its channels have different clocks, one 0.0 s, two +")
 
 
+@pytest.mark.parametrize(("held_s", "lag_s", "verdict"), [(12.0, 0.0, CANNOT_TELL), (2.0, 8.0, SHIFTED)])
+def test_readings_that_are_repeated_are_late_although_the_clock_is_right(held_s, lag_s, verdict):
+    """A lag that is longer than the age of the readings is one of the clock."""
+    known = channel(lag_s, 1)
+    period = np.floor(known.time_s / held_s)
+    held = dataclasses.replace(known, measured_db=known.measured_db[np.searchsorted(period, period)])
+    clock = judge_clock([held])
+    assert clock.verdict == verdict
+    assert clock.reason.startswith("readings are repeated for up to 10 s") == (verdict == CANNOT_TELL)
+    assert bool(clock.correction_s) == (verdict == SHIFTED)
+
+
 def test_clocks_that_agree_are_ok_and_their_intervals_hold():
     """Twelve flights: a shift is never called where there is none, and at most one interval misses."""
     inside = 0

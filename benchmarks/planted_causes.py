@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from aerpaw_cmp.common.units import wrap_degrees
 from aerpaw_cmp.compare import causes
-from aerpaw_cmp.compare.causes import OF_DIRECTION, SHOWN_DB, Trial, flight_cause
+from aerpaw_cmp.compare.causes import CATCH_ALL, SHOWN_DB, Trial, flight_cause
 from aerpaw_cmp.compare.evidence import LevelEvidence, in_bins
 from aerpaw_cmp.flight.clock import Along, ClockChannel, judge_clock
 from aerpaw_cmp.jobs.likely_cause import fall_without_lag_db
@@ -307,11 +307,11 @@ def run(flights: int, seed: int) -> list[tuple[tuple[str, ...], str]]:
 
 
 def named(evidence: LevelEvidence) -> str:
-    """Name of the cause of a flight. As in a report, a late clock comes before causes of direction."""
+    """Name of the cause of a flight. As in a report, a late clock comes before an antenna pattern."""
     cause = flight_cause([evidence])
     name = NONE if cause is None else cause.name
     late = evidence.clock is not None and evidence.clock.shifted and fall_without_lag_db([evidence]) >= SHOWN_DB
-    return "clock" if late and {*name.split(" or ")} & {NONE, *OF_DIRECTION} else name
+    return "clock" if late and {*name.split(" or ")} & {NONE, CATCH_ALL} else name
 
 
 def oracle(flights: int, seed: int, margins: tuple[float, ...]) -> dict[float, tuple[int, int]]:

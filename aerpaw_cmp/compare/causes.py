@@ -127,11 +127,11 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             named[either] = shown
     # an almost certain cause that may not be named shows that no explanation fits
     if any(_lead({other}, odds) >= _CERTAIN for other in certain - frozenset().union(*named)):
-        named = {either: shown for either, shown in named.items() if _CATCH_ALL not in either}
+        named = {either: shown for either, shown in named.items() if CATCH_ALL not in either}
     if not named:
         return _by_health(None, tables)
     # a gain over directions comes last, because it can look like many faults
-    either = min(named, key=lambda e: (_CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
+    either = min(named, key=lambda e: (CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
     cause = _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
 
@@ -266,7 +266,7 @@ _CONDITIONS = {
     "height": _Conditions(part=0.5, of_uav=True, most_left=1.0, follows=0.9),
     "pattern": _Conditions(lead=3.0, learned_share=0.25, part=0.5, most_left=1.0, follows=1.0),
     # high limits, because the best of many positions explains a part of many errors
-    "place": _Conditions(lead=2.5, share=0.3, part=0.75, of_tower=True, most_left=1.0, follows=0.9),
+    "place": _Conditions(lead=4.5, share=0.3, part=0.75, of_tower=True, most_left=1.0, follows=0.9),
     "saturation": _Conditions(part=0.5, most_left=1.0),
     "telemetry": _Conditions(part=0.5, of_uav=True, most_left=1.0, follows=0.9),
     "tower": _Conditions(part=0.65, follows=1.0, most_left=math.inf),
@@ -298,36 +298,40 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     certain = lead >= _CERTAIN and least_share <= _LEAST_SHARE and share <= 1.0 - 0.5 * _LEAST_SHARE
     if need.follows and any(m.residual_db.std() >= need.follows * m.evidence.measured_db.std() for m in alone):
         return False
-    if name == _CATCH_ALL and (known_db < _LEAST_DB or (lead < _SURE_GAIN and not _holds_in_halves(alone))):
+    usual = _usual_db(shown)
+    most = _MOST_IN_HALVES[usual is not None or alone_db <= _MOST_OF_ERROR * known_db]
+    if name == CATCH_ALL and (known_db < _LEAST_DB or (lead < _SURE_GAIN and not _holds_in_halves(alone, most))):
         return False
     # a floor that the settings remove is known, and explains why the remaining low links look too strong
     if (name == "floor" and sound[0].evidence.floored) or known_db - alone_db < SHOWN_DB:
         return False
-    usual = _usual_db(shown)
     if usual is None:
         enough = not need.part or after_db <= before_db - need.part * (before_db - _together_db(shown))
         restored = False
     else:
         # the error is larger than on any held-out flight, and usual after correcting the cause
-        restored = need.most_left == 1.0 and name != _CATCH_ALL and known_db > usual[1] >= alone_db
+        restored = need.most_left == 1.0 and name != CATCH_ALL and known_db > usual[1] >= alone_db
         # do not name such a cause for an error that held-out flights also have
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
         enough = known_db > least_db and alone_db <= need.most_left * usual[1]
     return enough and (share <= 1.0 - least_share or certain or restored)
 
 
-def _holds_in_halves(models: Sequence[_Model]) -> bool:
+def _holds_in_halves(models: Sequence[_Model], most: float) -> bool:
     """Check whether a gain over directions that is fitted to one half of the flight reduces the error of the other."""
     pairs = ((m.evidence.measured_db - m.evidence.predicted_db, m.trials[0].columns) for m in models)
     squares = [squares_of_halves(error, columns, _CORRELATED_BINS) for error, columns in pairs if columns is not None]
     before, after = np.sum(squares, axis=0)
-    return bool(after <= _MOST_IN_HALVES**2 * before)
+    return bool(after <= most**2 * before)
 
 
-# Number of means per independent sample of the error, and largest ratio of the error of the other half with and without
-# the gain. Halves may show different directions, so a pattern with the next log odds per channel is not tested. Learned
-# antennas leave an error of 3 dB and more, so a pattern is not the cause of an error below the last number [dB].
-_CORRELATED_BINS, _MOST_IN_HALVES, _SURE_GAIN, _LEAST_DB = 10.0, 0.85, 20.0, 2.5
+# Largest ratio of the error of the other half with and without the gain. The second one is for learned antennas and for
+# a gain that leaves at most the next share of the error, because halves of a short flight show few directions.
+_MOST_IN_HALVES, _MOST_OF_ERROR = (0.75, 0.85), 0.5
+# Number of means per independent sample of the error. Halves may show different directions, so a pattern with the next
+# log odds per channel is not tested. Learned antennas leave an error of 3 dB and more, so a pattern is not the cause of
+# an error below the last number [dB].
+_CORRELATED_BINS, _SURE_GAIN, _LEAST_DB = 10.0, 20.0, 2.5
 
 
 def _usual_db(shown: Sequence[_Models]) -> tuple[float, float] | None:
@@ -394,11 +398,12 @@ def _models(e: LevelEvidence) -> _Models:
 
     def best_of(sets: Iterable[tuple[Trial, ...]], at: NoiseParameters) -> list[_Model]:
         """Return the likeliest model of each set of names, best first, with its own noise."""
-        best: dict[frozenset[str], _Model] = {}
+        best: dict[tuple[frozenset[str], bool], _Model] = {}
         for trials in sets:
             tried = model(*trials, at=at, search=False)
-            names = _names(tried)
-            if len(names) == len(trials) and (names not in best or tried.gain > best[names].gain):
+            # with other noise, levels of another time may be likelier than unknown gains
+            names = _names(tried), not trials[-1].name and trials[-1].columns is not None
+            if len(names[0]) == len(trials) and (names not in best or tried.gain > best[names].gain):
                 best[names] = tried
         likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
         return sorted((model(*m.trials, at=at) for m in likely), key=lambda m: -m.gain)
@@ -498,14 +503,15 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
             name="clock", sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
             change_db=late - e.predicted_db, estimate=(lag, *e.clock.ci95_s),
         )  # fmt: skip
-        yield from _drifting(e)
-        return
     yield from _drifting(e)
     # also try levels of another time or in reverse order, so that they are not attributed to other causes
     since, length = e.time_s - e.time_s[0], max(float(np.ptp(e.time_s)), 1e-9)
     backwards = np.interp(length - since, since, e.predicted_db)
+    channels = 1 + len(e.others)  # which have the telemetry in common
     if _nearer(e, backwards):
-        yield Trial(cost=_RARE, change_db=backwards - e.predicted_db)
+        yield Trial(cost=_RARE / channels, channels=channels, change_db=backwards - e.predicted_db)
+    if e.clock is not None and e.clock.shifted:
+        return
     lags = [*_LAGS_S, *np.arange(_LAGS_S[-1], length + _LAGS_S[0], 2.0 * _LAG_STEP_S)]
     levels = np.array([np.interp((since - lag) % length, since, e.predicted_db) for lag in lags])
     if (nearer := _nearer(e, levels)).any():
@@ -528,8 +534,10 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
         return
     best, cost = _likeliest(e, levels, possible=nearer)
     rate = pairs[best][0]
+    # the best rate may lie beyond those that were searched, and a clock is not so wrong
     yield Trial(
-        name="clock", cost=_RARE + cost, change_db=levels[best] - e.predicted_db,
+        name="clock" if abs(rate) < max(_RATES) else _UNNAMED,
+        cost=_RARE + cost, change_db=levels[best] - e.predicted_db,
         sentence=f"the radio clock {'gains' if rate > 0 else 'loses'} {Printed(100.0 * abs(rate)):.1f} % "
         f"({abs(rate) * length:.0f} s in {length:.0f} s)",
         next_step="synchronise both clocks by GPS or NTP", estimate=(rate * length, math.nan, math.nan),
@@ -754,10 +762,10 @@ def _seconds(other: LevelEvidence, e: LevelEvidence) -> FloatArray:
     return np.asarray(other.time_s + (other.start - e.start) / np.timedelta64(1, "s"))
 
 
-_CATCH_ALL = "pattern"
+CATCH_ALL = "pattern"
 
 # Causes that depend on the direction alone, and therefore imitate errors of the propagation model.
-OF_DIRECTION = frozenset({"blocked", _CATCH_ALL})
+OF_DIRECTION = frozenset({"blocked", CATCH_ALL})
 # Causes that a step replaces if held-out flights do not have such a step.
 _OF_HEALTH = OF_DIRECTION | {"gain step"}
 
@@ -778,7 +786,7 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
     if e.turned_db:  # this column can remove the known pattern: it adds the mean of the level over all headings
         columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
     sentence, step = _PATTERN[e.antenna]
-    yield Trial(name=_CATCH_ALL, sentence=sentence, next_step=step, columns=np.column_stack(columns))
+    yield Trial(name=CATCH_ALL, sentence=sentence, next_step=step, columns=np.column_stack(columns))
 
 
 # Prior standard deviations of the terms of an antenna's gain, of steps and of losses [dB].
@@ -872,6 +880,24 @@ def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) ->
 # --- faults of the receiver ----------------------------------------------------------------------------------------
 
 
+def _controlled(e: LevelEvidence) -> Iterator[Trial]:
+    """Yield a gain control, which follows the mean level over some time, as an alternative without a name."""
+    for slow in slow_levels(e.time_s, e.predicted_db):
+        yield Trial(cost=math.log(len(_CONTROLS_S)), columns=_SLOPE * (slow - slow.mean())[:, None])
+
+
+def slow_levels(time_s: FloatArray, level_db: FloatArray) -> Iterator[FloatArray]:
+    """Yield means (n,) of the level up to each time (n,), with weights that decay over the times of gain controls."""
+    for memory_s in _CONTROLS_S:
+        keep, slow = np.exp(-np.diff(time_s, prepend=time_s[:1]) / memory_s).tolist(), level_db.tolist()
+        for i in range(1, len(slow)):
+            slow[i] += keep[i] * (slow[i - 1] - slow[i])
+        yield np.array(slow)
+
+
+_CONTROLS_S = (10.0, 20.0, 40.0)
+
+
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
@@ -935,6 +961,8 @@ _LEAST_CLIPPED = 0.06
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     """Return the samples at the receiver's limit, or None if the samples at the end of the levels fade like others."""
+    if e.step_db > PILE_DB:  # each rounded level is a pile
+        return None
     end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
     pile = side * (e.measured_db - end) < PILE_DB
     step = np.abs(np.diff(e.measured_db))
@@ -1064,5 +1092,5 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
 
 CANDIDATES: tuple[Callable[[LevelEvidence], Iterator[Trial]], ...] = (
     _clock, _heading, _attitude, _misread, _height, _tower, _place, _channels, _pattern, _cell, _decibels,
-    _lock, _no_detection, _limits, _blocked, _gain_step,
+    _controlled, _lock, _no_detection, _limits, _blocked, _gain_step,
 )  # fmt: skip

@@ -11,9 +11,9 @@ from typing import TypeVar
 import numpy as np
 
 from ..common.errors import InputError, UsageError
-from ..common.units import FOOT_M, FloatArray
+from ..common.units import FOOT_M, AnyArray, FloatArray
 from ..compare import level as rss
-from ..compare.causes import OF_DIRECTION, SHOWN_DB, flight_cause, gains_by_direction
+from ..compare.causes import CATCH_ALL, OF_DIRECTION, SHOWN_DB, flight_cause, gains_by_direction, slow_levels
 from ..compare.evidence import LevelEvidence
 from ..compare.gains import turned
 from ..compare.result import Cause, RssResult
@@ -72,8 +72,8 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     cause = flight_cause(evidence)
     late = _late_clock(evidence, [series.tower for series, _, _ in compared])
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
-    # prefer the test of the clock to causes of direction, which imitate a lag
-    if late is not None and by_direction:
+    # prefer the test of the clock, which knows gains over directions, to a pattern; it does not know obstacles
+    if late is not None and (cause is None or CATCH_ALL in cause.name.split(" or ")):
         return late, None
     # without an antenna that the flight file names, errors by direction are expected, and a caution has the reason
     if any(not c.used for c in data.settings.cautions) and by_direction:
@@ -111,16 +111,25 @@ def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cau
 
 
 def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
-    """Return by how much the RMSE of some channels falls if the lags of their clocks are corrected [dB]."""
-    before, after = list[FloatArray](), list[FloatArray]()
+    """Return by how much the RMSE of some channels falls if the lags of their clocks are corrected [dB].
+
+    It is 0 unless the RMSE also falls if a share of the slow level is fitted: a gain control reduces slow changes of
+    the level, so that the rest seems to be early.
+    """
+    squares = list[AnyArray]()
     for e in channels:
         lag = 0.0 if e.clock is None else e.clock.radio_minus_telemetry_s
         known = np.isfinite(e.measured_db) & np.isfinite(e.predicted_db)
-        time_s, measured_db, predicted_db = e.time_s[known], e.measured_db[known], e.predicted_db[known]
-        if len(time_s):
-            for errors, level_db in ((before, predicted_db), (after, np.interp(time_s - lag, time_s, predicted_db))):
-                errors.append(measured_db - level_db - (measured_db - level_db).mean())
-    return float(np.concatenate(before).std() - np.concatenate(after).std()) if before else 0.0
+        time_s, level_db = e.time_s[known], e.predicted_db[known]
+        errors_db = e.measured_db[known] - np.stack([level_db, np.interp(time_s - lag, time_s, level_db)])
+        fitted = (np.zeros(len(time_s)), *slow_levels(time_s, level_db)) if len(time_s) else ()
+        designs = (np.column_stack([np.ones(len(time_s)), slow]) for slow in fitted)
+        squares += [np.square(errors_db.T - x @ np.linalg.lstsq(x, errors_db.T, rcond=None)[0]) for x in designs]
+    if not squares:
+        return 0.0
+    of_models = (np.sqrt(np.concatenate(squares[i::4]).mean(axis=0)) for i in range(4))
+    fall_db, *others_db = (float(before - after) for before, after in of_models)
+    return fall_db if min(others_db) > 0.0 else 0.0
 
 
 _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site"

@@ -226,7 +226,7 @@ def test_two_channels_are_one_flight_and_a_second_trouble_hides_none() -> None:
 @pytest.mark.parametrize(("antenna", "named"), [("measured", "pattern"), ("learned", NONE)])
 def test_what_learned_antennas_miss_on_any_flight_is_no_cause(antenna: str, named: str) -> None:
     """A smooth error that is almost a quarter of the RMSE is usual for learned antennas only."""
-    sound = _sound()
+    sound = _sound(n=1000)
     error = 2.0 * (sound.measured_db - sound.predicted_db) + 2.4 * np.sin(np.radians(2 * sound.uav_azimuth_deg))
     assert _named(replace(sound, measured_db=sound.predicted_db + error, antenna=antenna)) == named
 
@@ -731,10 +731,10 @@ def test_no_antenna_pattern_beside_a_certain_cause_that_is_not_named(
     assert _named(replace(e, measured_db=e.measured_db + size_db * small)) == named
 
 
-def test_an_antenna_pattern_needs_log_odds() -> None:
-    sound, extra = _sound(), np.random.default_rng(8).normal(0.0, 2.0, 300)
+def test_an_antenna_pattern_needs_log_odds_and_a_quarter_of_the_error_of_the_other_half() -> None:
+    sound, extra = _sound(n=600), np.random.default_rng(8).normal(0.0, 2.0, 600)
     lobes = np.sin(np.radians(2.0 * sound.uav_azimuth_deg))
-    for size_db, odds, named in ((3.0, 4.0, True), (3.0, 2.0, False), (7.0, 2.0, False)):
+    for size_db, odds, named in ((4.5, 4.0, True), (4.5, 2.0, False), (3.0, 4.0, False)):
         binned = in_bins(replace(sound, measured_db=sound.measured_db + size_db * lobes + extra))
         assert binned is not None
         assert causes._explains("pattern", [causes._models(binned)], odds, set()) == named
@@ -776,3 +776,45 @@ def test_an_obstacle_shadows_all_channels_of_a_tower() -> None:
     shadowed = [replace(e, measured_db=e.measured_db - loss_db) for e in (one, other)]
     assert _named(*shadowed) == "blocked"
     assert _named(shadowed[0], other) != "blocked"
+
+
+def test_a_gain_control_makes_no_clock_late() -> None:
+    """Without its slow changes, the level seems to be early."""
+    sound = _sound()
+    level = sound.predicted_db + 0.3 * (sound.measured_db - sound.predicted_db - MEASURED_DB)
+    _, slow, _ = causes.slow_levels(sound.time_s, level)
+    early = np.interp(sound.time_s + 6.0, sound.time_s, level), level - 0.8 * slow
+    falls = [likely_cause.fall_without_lag_db([replace(sound, measured_db=each, clock=_clock(-6.0, "shifted"))])
+             for each in early]  # fmt: skip
+    assert falls[0] > 0.1
+    assert falls[1] == 0.0
+    assert _named(replace(sound, measured_db=early[1])) == NONE
+
+
+def test_readings_that_are_repeated_are_one_reading() -> None:
+    """The least of them was detected as the others were."""
+    sound = _sound(n=600)
+    kept = np.arange(600) // 20 * 20
+    held = in_bins(replace(sound, measured_db=sound.measured_db[kept]))
+    lost = in_bins(replace(sound, measured_db=np.maximum(sound.measured_db, np.quantile(sound.measured_db, 0.3))))
+    assert held is not None
+    assert lost is not None
+    assert held.least is None
+    assert lost.least is not None
+
+
+def test_levels_that_are_rounded_to_wide_steps_have_no_ceiling() -> None:
+    """Each of them is a pile."""
+    sound, ceiling = _sound(), in_bins(_planted()["saturation"])
+    rounded = in_bins(replace(sound, measured_db=5.0 * np.round(sound.measured_db / 5.0)))
+    assert ceiling is not None
+    assert rounded is not None
+    assert rounded.step_db == 5.0
+    assert causes._pile(ceiling, -1.0) is not None
+    assert causes._pile(replace(ceiling, step_db=5.0), -1.0) is None
+
+
+def test_a_clock_at_the_end_of_the_searched_rates_has_no_name() -> None:
+    sound = _sound(n=600)
+    late = np.interp(0.95 * sound.time_s, sound.time_s, sound.predicted_db) + sound.measured_db - sound.predicted_db
+    assert _named(replace(sound, measured_db=late, clock=_clock(6.1, "cannot tell"))) == NONE

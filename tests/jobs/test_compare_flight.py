@@ -43,6 +43,7 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         (True, None, 0.4, True),
         (True, None, 0.02, False),
         (True, "pattern or blocked", 0.4, True),
+        (True, "blocked", 0.4, False),  # the clock test knows gains over directions, but no obstacles
         (True, "lock", 0.4, False),
         (False, None, 0.4, False),
         (True, None, 0.4, None),  # nothing is asked after an error below 1 dB

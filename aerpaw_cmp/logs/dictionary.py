@@ -93,7 +93,8 @@ def _quantity(row: Mapping[str, Any]) -> Quantity:
 
 
 QUANTITIES = tuple(_quantity(row) for row in _FILE["quantities"])
-_PATTERNS = {name: re.compile("".join(pieces)) for name, pieces in _FILE["patterns"].items()}
+# Expressions that are searched in plain names.
+PATTERNS = {name: re.compile("".join(pieces)) for name, pieces in _FILE["patterns"].items()}
 ZONES: Mapping[str, Mapping[str, Any]] = _FILE["zones"]
 HINTS: Mapping[str, Sequence[str]] = _FILE["hints"]
 FIXES: Mapping[str, str] = _FILE["fixes"]
@@ -195,7 +196,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
         # 'Time (+02:00)'; 'heightAboveGround'
         texts += [bare, plain(in_brackets(name)[2]), plain(_CAMEL.sub(" ", name))]
     texts = [
-        _PATTERNS["joined_neighbour"].sub(r"neighbour \1 ", text).replace("  ", " ") for text in dict.fromkeys(texts)
+        PATTERNS["joined_neighbour"].sub(r"neighbour \1 ", text).replace("  ", " ") for text in dict.fromkeys(texts)
     ]
     hits = ((row, text) for text in texts for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
@@ -206,37 +207,36 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
         return None
     if row.unit and unit in UNITS and (UNITS[unit][0] != row.unit) and row.role in ("position", "angle", "velocity"):
         unit = ""  # the W of 'Longitude (W)' is not watts, and the m of 'vel_n_m_s' is not metres
-    rat = "nr" if _PATTERNS["nr"].search(text) else "lte" if _PATTERNS["lte"].search(text) else ""
-    digits = _PATTERNS["number"].search(re.sub(r"\b[45] ?g\b", "", text))
+    rat = "nr" if PATTERNS["nr"].search(text) else "lte" if PATTERNS["lte"].search(text) else ""
+    digits = PATTERNS["number"].search(re.sub(r"\b[45] ?g\b", "", text))
     number = next((group for group in digits.groups() if group), "0") if digits else "0"
-    second = _PATTERNS["secondary"].search(text)
-    place = f"n{number}" if _PATTERNS["neighbour"].search(text) else f"scell{second[1]}" if second else "serving"
-    if place == "serving" and (other := _PATTERNS["other"].search(text)):
+    second = PATTERNS["secondary"].search(text)
+    place = f"n{number}" if PATTERNS["neighbour"].search(text) else f"scell{second[1]}" if second else "serving"
+    if place == "serving" and (other := PATTERNS["other"].search(text)):
         place = (other[1] or other[2] or f"cell{other[3]}").replace(" ", "")
-    part = "mean" if _PATTERNS["mean"].search(text) else "port" if _PATTERNS["port"].search(text) else ""
-    return Meaning(row, unit, rat, place, indirect=_PATTERNS["indirect"].search(text) is not None, part=part)
+    part = "mean" if PATTERNS["mean"].search(text) else "port" if PATTERNS["port"].search(text) else ""
+    return Meaning(row, unit, rat, place, indirect=PATTERNS["indirect"].search(text) is not None, part=part)
 
 
 # Words that pairs of an identity and a level do not share, or that only name the radio access or the serving cell.
 _UNPAIRED = re.compile(
-    rf"{_PATTERNS['mean'].pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primary|pcell|pscell|spcell|dbm?)\b"
+    rf"{PATTERNS['mean'].pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primary|pcell|pscell|spcell|dbm?)\b"
 )
 
 _PAIRED = ("RSRP", "RSSI", "RSCP")
-# Words for a cell, a beam or an access point, and words that follow them.
-_WHO = re.compile(
-    r"\b(tower|node|site|base ?station|bs|[eg]nb|cell|sector|beam|ssb|ap|access point|b?ssid|e?ci|nci|l?cid|[en]?cgi"
-    r"|rnti|gateway|gw|mac)\b"
-)
 _OF_WHO = re.compile(r"\b(id|identity|name|no|num|number|index|address|addr)\b")
 
 
 def _split(name: str, what: Meaning | None) -> tuple[str, str]:
     """Return the words that name a cell other than its PCI, and the words that an identity and a level share."""
     bare = re.sub(r"(?<=[a-z])(?=\d)", " ", without_unit(name)[0])
-    kind = "" if what and what.quantity.role != "identity" else " ".join(part[0] for part in _WHO.finditer(bare))
+    kind = (
+        ""
+        if what and what.quantity.role != "identity"
+        else " ".join(part[0] for part in PATTERNS["who"].finditer(bare))
+    )
     form = next((form for form, row in _forms() if what and row.name == what.quantity.name), _OF_WHO)
-    rest = _OF_WHO.sub(" ", _WHO.sub(" ", form.sub(" ", bare)))
+    rest = _OF_WHO.sub(" ", PATTERNS["who"].sub(" ", form.sub(" ", bare)))
     return kind, " ".join(_UNPAIRED.sub(" ", rest).split())
 
 
@@ -277,7 +277,7 @@ def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning |
         if what is not None and rest in shared and rest in cells.get(("level", what.place), {}):
             several = any(shared[rest] & rats for other, rats in shared.items() if other != rest)
             # the target of a handover has an identity, the target of a model has none
-            indirect = what.indirect and _PATTERNS["indirect"].search(rest.replace("target", "")) is not None
+            indirect = what.indirect and PATTERNS["indirect"].search(rest.replace("target", "")) is not None
             what = replace(what, place=f"cell {rest}" if several and rest else what.place, indirect=indirect)
         placed.append(what)
     return placed
@@ -475,13 +475,10 @@ PROGRAMS = tuple(
 AERPAW_MAT = next(known for known in PROGRAMS if known.name == "AERPAW .mat")
 
 
-UNLIKE_A_LEVEL = _PATTERNS["unlike_a_level"]
-
-
 def names_a_cell(words: str, *, alone: bool = False) -> bool:
     """Check whether a plain name names a cell, an antenna or a beam, without other words if ``alone``."""
-    return _PATTERNS["of_a_cell"].fullmatch(words) is not None or (
-        not alone and _PATTERNS["cell_id"].search(words) is not None
+    return PATTERNS["of_a_cell"].fullmatch(words) is not None or (
+        not alone and PATTERNS["cell_id"].search(words) is not None
     )
 
 
@@ -491,7 +488,7 @@ def like_levels(names: Iterable[str]) -> list[str]:
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [
         name for name, text in words.items()
-        if _PATTERNS["like_a_level"].search(text) and not UNLIKE_A_LEVEL.search(text)
+        if PATTERNS["like_a_level"].search(text) and not PATTERNS["unlike_a_level"].search(text)
         and not (electric and re.fullmatch(r"(.* )?(power|pwr)( m?w)?", text))
     ]  # fmt: skip
 

@@ -155,13 +155,6 @@ def _is_divided(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
     return max(values.values(), default=0) > 1
 
 
-# Words in column names that do not identify a series: other cells, states of the aircraft, levels in steps.
-_OTHERS = re.compile(
-    r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover|bars?|asu|quality|percent"
-    r"|strength|signal|level|rate|wp|rank|layers)\b|(mode|state|status|event|step|waypoint)\b"
-)
-
-
 def cell_columns(sheet: _sheet.Sheet) -> list[int]:
     """Return the columns that are named like a cell and that the dictionary does not know."""
     return [
@@ -188,7 +181,9 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
             return []
         table = table[["time", "levels", *(str(i) for i in known)]]
     unknown = [
-        i for i, m in enumerate(sheet.meanings) if m is None and i not in marks and not _OTHERS.search(sheet.plain[i])
+        i
+        for i, m in enumerate(sheet.meanings)
+        if m is None and i not in marks and not dictionary.PATTERNS["no_identity"].search(sheet.plain[i])
     ]
     found: list[int] = []
     while (repeated := table.duplicated().mean()) >= _REPEATED:

@@ -322,6 +322,8 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
         )
         return altitude, about
     how = "the altitude at rest on the ground" if climbs else "that of the first position"
+    if not climbs and (before := int((~lost[: known[0]]).sum())):
+        how += f" with a height, after {counted(before, 'position')} without: was it on the ground there?"
     zero = "the ellipsoid" if datum == "ellipsoid" else "sea level"
     rows.warnings.append(f"altitudes are above {zero}: {first:.1f} m, {how}, was subtracted")
     about |= {"takeoff_from": "rest" if climbs else "first position", "height_taken_off_m": round(first, 3)}

@@ -421,7 +421,10 @@ class Sheet:
         if meaning is not None:
             like |= meaning.quantity.role in _OF_INTEREST
         elif not like:
-            like = _WHERE_OR_WHEN.search(words) is not None or self.unit_read(column) in _OF_LEVELS[1:]
+            like = (
+                dictionary.PATTERNS["where_or_when"].search(words) is not None
+                or self.unit_read(column) in _OF_LEVELS[1:]
+            )
             # an index of the level of an unknown radio access, where no level is read
             levels = (what for i in self.used if (what := self.meanings[i]) and what.quantity.role == "rss")
             like |= _ASU.search(words) is not None and not any(levels)
@@ -431,10 +434,6 @@ class Sheet:
 
 
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
-_WHERE_OR_WHEN = re.compile(
-    r"\b(lat|latitude|lon|lng|long|longitude|alt|altitude|height|date|(date|wall|up)? ?(time|clock)( ?stamp)?|utc"
-    r"|epoch)\b"
-)
 _ASU = re.compile(r"\basu\b")
 # Gains of a receiver, not those of an antenna or a transmitter.
 _GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(uation|uator)?)\b")
@@ -1014,7 +1013,7 @@ def _has_levels(sheet: Sheet, column: int) -> bool:
     """Check whether the numbers of a column look like levels in dBm, such as those of a column named by a tower."""
     known = sheet.numbers(column)[np.isfinite(sheet.numbers(column))]
     like = len(known) > 1 and (known < -30).mean() > 0.9 and known.min() > -150
-    return bool(like and not dictionary.UNLIKE_A_LEVEL.search(sheet.plain[column]))
+    return bool(like and not dictionary.PATTERNS["unlike_a_level"].search(sheet.plain[column]))
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:

@@ -63,11 +63,6 @@ _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
 # A time as a spreadsheet shows it: minutes, seconds and tenths without the hour.
 _MINUTES = re.compile(r"\d{1,2}:\d\d[.,]\d")
 _COMMON = re.compile((_text.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
-# The twelve months, by the first letters of their names in languages of Europe, without accents.
-_MONTHS = re.compile(
-    "(jan|ene|gen)|(feb|fev)|(mar|mrt|mae)|(apr|avr|abr)|(may|mai|maj|mag|mei)|(jun|juin|giu)|(jul|juil|lug)|(aug|aou|ago)"
-    "|(sep|set)|(oct|okt|out|ott)|(nov)|(dec|dez|dic)"
-)
 # Dates with or without hyphens, and Nemo's: its summary of the log ``24Feb09`` contains the date ``2024 Feb 09``.
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
@@ -99,7 +94,9 @@ def _date_in_name(name: str) -> str | None:
 
 
 def _month(word: str) -> int:
-    known = _MONTHS.match(unicodedata.normalize("NFKD", word.lower()).encode("ascii", "ignore").decode())
+    known = dictionary.PATTERNS["months"].match(
+        unicodedata.normalize("NFKD", word.lower()).encode("ascii", "ignore").decode()
+    )
     return 0 if known is None else known.lastindex or 0
 
 

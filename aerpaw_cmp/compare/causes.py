@@ -597,20 +597,20 @@ _BETWEEN = np.linspace(-0.8, 0.8, 9)
 
 
 def _tuned(
-    e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Callable[[float, FloatArray], Trial]
+    e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Trial, words: Callable[[float], str]
 ) -> Trial:
     """Return the trial with the likeliest value. Changes at values between the given ones are interpolated."""
     # the value 0 changes nothing, and the interpolation goes through it
     values = sorted({0.0, *changes_db})
-    likely = _profiled(e, {value: trial(value, change) for value, change in changes_db.items()})
-    best = likely.estimate[0]
+    likely = _profiled(e, {value: dataclasses.replace(trial, change_db=change) for value, change in changes_db.items()})
     table = np.stack([changes_db.get(value, np.zeros(len(e.time_s))) for value in values])
-    at = values.index(best)
-    between = np.interp(at + _BETWEEN, np.arange(len(values)), values)
-    curve = _spline(np.array(values), np.append(between, [*changes_db])) @ table
-    finer = {value: trial(value, change) for value, change in zip((*between.tolist(), *changes_db), curve, strict=True)}
+    between = np.interp(values.index(likely.estimate[0]) + _BETWEEN, np.arange(len(values)), values)
+    tried = np.append(between, [*changes_db])
+    curve = _spline(np.array(values), tried) @ table
+    finer = {value: dataclasses.replace(trial, change_db=at) for value, at in zip(tried.tolist(), curve, strict=True)}
     finer.pop(0.0, None)
-    return _profiled(e, finer, _fitted(e, likely).parameters)
+    found = _profiled(e, finer, _fitted(e, likely).parameters)
+    return dataclasses.replace(found, sentence=words(found.estimate[0]))
 
 
 def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
@@ -626,18 +626,11 @@ def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
 
 def _heading(e: LevelEvidence) -> Iterator[Trial]:
     """Yield an antenna turned about the vertical."""
-    # if the logged attitude is not used, the heading cannot be wrong
-    cost = _RARE if "logged" in e.attitude_db else 0.0
-
-    def turned(angle: float, change: FloatArray) -> Trial:
-        return Trial(
-            name="heading", cost=cost, change_db=change,
-            next_step="check the antenna's mount and the logged yaw",
-            sentence=f"the UAV antenna is turned clockwise by {angle:.0f} degrees",
-        )  # fmt: skip
-
     if e.turned_db:
-        yield _tuned(e, e.turned_db, turned)
+        # if the logged attitude is not used, the heading cannot be wrong
+        cost, step = _RARE if "logged" in e.attitude_db else 0.0, "check the antenna's mount and the logged yaw"
+        words = "the UAV antenna is turned clockwise by {:.0f} degrees".format
+        yield _tuned(e, e.turned_db, Trial(name="heading", cost=cost, next_step=step), words)
 
 
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
@@ -653,16 +646,12 @@ def _attitude(e: LevelEvidence) -> Iterator[Trial]:
 def _height(e: LevelEvidence) -> Iterator[Trial]:
     """Yield heights of another datum, and heights that drift."""
 
-    def raised(rise: float, change: FloatArray) -> Trial:
-        return Trial(
-            name="height", change_db=change,
-            sentence=f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says",
-            next_step="check the telemetry's height datum",
-        )  # fmt: skip
+    def words(rise: float) -> str:
+        return f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says"
 
     if not e.raised_db:
         return
-    yield _tuned(e, e.raised_db, raised)
+    yield _tuned(e, e.raised_db, Trial(name="height", next_step="check the telemetry's height datum"), words)
     changes = _growing(e)
     best, cost = _likeliest(e, e.predicted_db + changes)
     yield Trial(

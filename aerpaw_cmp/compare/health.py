@@ -80,7 +80,8 @@ def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[fl
     series = [binned(f.time_s, error_db) for f, error_db in zip(flights, errors_db, strict=True)]
     seconds = [float(binned(f.time_s, e, 1.0)[1].std()) for f, e in zip(flights, errors_db, strict=True)]
     numbers = _noise(series)
-    places = [_interpolated(at, f) for f, (at, _) in zip(flights, series, strict=True)]
+    paths = zip(flights, series, strict=True)
+    places = [np.column_stack([np.interp(at, f.time_s, axis) for axis in f.place_m.T]) for f, (at, _) in paths]
     apart = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in places]
     locked = [f.locked for f in flights if f.locked is not None and np.isfinite(f.locked).any()]
     judged = [step_chi2(*each, noise=_noise([s for s in series if s is not each] or [each])) for each in series]
@@ -144,11 +145,6 @@ def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> 
     count = np.bincount(place)
     mean_db = np.bincount(place, error_db) / count
     return np.bincount(place, time_s) / count, mean_db - mean_db.mean()
-
-
-def _interpolated(at: FloatArray, flight: HeldOut) -> FloatArray:
-    """Return the positions (m, 3) of the UAV at times (m,)."""
-    return np.column_stack([np.interp(at, flight.time_s, axis) for axis in flight.place_m.T])
 
 
 def _noise(series: Sequence[tuple[FloatArray, FloatArray]]) -> Noise:

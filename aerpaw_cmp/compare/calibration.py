@@ -137,17 +137,11 @@ class Learned(Mounted):
 
     def spread(self, antenna: str) -> Spread:
         """Return the error model of a level at an antenna, excluding the standard deviation of the gain."""
-        model = self.model
         sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
         campaign = next((s.campaign for s in self.fit.rows if s.antenna == antenna), "")
-        own_sd_db, noise_sd_db = model.scales_db(campaign)
-        return Spread(
-            own_sd_db=own_sd_db,
-            noise_sd_db=noise_sd_db,
-            fading_sd_db=sd_db,
-            fading_kurtosis=kurtosis,
-            bin_s=model.bin_s,
-        )
+        own_sd_db, noise_sd_db = self.model.scales_db(antenna, campaign)
+        fading = {"fading_sd_db": sd_db, "fading_kurtosis": kurtosis}
+        return Spread(own_sd_db=own_sd_db, noise_sd_db=noise_sd_db, bin_s=self.model.bin_s, **fading)
 
     def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Return the gain of both ends and its standard deviation (n,) [dB], up to a constant."""

@@ -219,14 +219,15 @@ class GainModel:
     noise_sd_db: float = 1.5
     bin_s: float = 4.0
     campaigns: tuple[tuple[str, float, float], ...] = ()
-    """Name, ``own_sd_db`` and ``noise_sd_db`` of each campaign that has its own values."""
+    """Name, ``own_sd_db`` and ``noise_sd_db`` of each campaign that has its own values. A fit uses those of campaigns.
 
-    def scales_db(self, campaign: str) -> tuple[float, float]:
-        """Return the standard deviations of nuisance and noise of a campaign [dB]."""
-        return next(
-            ((own, noise) for name, own, noise in self.campaigns if name == campaign),
-            (self.own_sd_db, self.noise_sd_db),
-        )
+    Antennas with enough levels follow, for the error of a level: the shadowing differs between ports of a tower.
+    """
+
+    def scales_db(self, *names: str) -> tuple[float, float]:
+        """Return the standard deviations of nuisance and noise of the first name that has its own values [dB]."""
+        known = {name: (own, noise) for name, own, noise in self.campaigns}
+        return next((known[name] for name in names if name in known), (self.own_sd_db, self.noise_sd_db))
 
     def scaled(self, factor: float) -> GainModel:
         """Return the model with all standard deviations multiplied by a factor."""
@@ -581,15 +582,21 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
 # 2.0 and 2.2 for LTE, 2.0 and 3.0 for AADM. One pair for all campaigns is 18 to 99 nat less likely.
 _CAMPAIGN_SCALES_DB = tuple(product((0.8, 1.2, 2.0, 3.0), (1.0, 1.5, 2.2, 3.2)))
 
+# Number of these means that determines the scales of an antenna. A tower of AADM has 42, a port of dataset 12 has 310.
+_FEWEST_MEANS = 100
+
 
 def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
-    """Return the model with the most likely nuisance and noise per campaign, if there are several campaigns."""
+    """Return the model with the most likely scales per campaign and per antenna, if there are several campaigns."""
     names = list(dict.fromkeys(s.campaign for s in rows))
     if len(names) == 1 or model.campaigns:
         return model
     # every second mean is enough to find the scales, and the Cholesky factor then takes an eighth of the time
     some = [s.part(np.arange(0, len(s), 2)) for s in rows]
-    chosen = ((n, *_likeliest(_CAMPAIGN_SCALES_DB, [s for s in some if s.campaign == n], model.terms)) for n in names)
+    every = dict.fromkeys([*names, *(s.antenna for s in some)])
+    parts = {name: [s for s in some if name in (s.campaign, s.antenna)] for name in every}
+    determined = [name for name in every if name in names or sum(map(len, parts[name])) >= _FEWEST_MEANS]
+    chosen = ((name, *_likeliest(_CAMPAIGN_SCALES_DB, parts[name], model.terms)) for name in determined)
     return dataclasses.replace(model, campaigns=tuple(chosen))
 
 

@@ -34,6 +34,14 @@ def campaign(name: str, channel: str, seeds: range, gains=GAINS, *, noise_db: fl
 QUIET, LOUD = campaign("quiet", "A", range(20, 23)), campaign("loud", "B", range(30, 32), noise_db=6.0)
 
 
+def test_each_port_of_a_campaign_has_the_error_of_its_own_levels() -> None:
+    """The fit has one noise per campaign. The stated error of a port with more noise is larger."""
+    noisy = [dataclasses.replace(s, flight=f"n{s.flight}", campaign="quiet") for s in LOUD]
+    learned = learn([*QUIET, *noisy, *campaign("other", "C", range(40, 42))], Recipe(GainModel()))
+    errors = [learned.spread(some[0].antenna) for some in (QUIET, LOUD)]
+    assert errors[1].noise_sd_db > 1.4 * errors[0].noise_sd_db
+
+
 def rmse(values) -> float:
     return float(np.std(values))
 

@@ -472,6 +472,7 @@ class Program:
 PROGRAMS = tuple(
     Program(**{**row, "signs": tuple(frozenset(names) for names in row["signs"])}) for row in _FILE["programs"]
 )
+_SIGNS = frozenset[str]().union(*(sign for known in PROGRAMS for sign in known.signs))
 AERPAW_MAT = next(known for known in PROGRAMS if known.name == "AERPAW .mat")
 
 
@@ -501,6 +502,8 @@ def can_be_level(name: str) -> bool:
 def program(names: Collection[str]) -> Program | None:
     """Return the program that wrote a table with such plain names, or None if no program is recognised."""
     present = set(names)
+    if present.isdisjoint(_SIGNS):  # sniffers test lines of any kind
+        return None
     return next((item for item in PROGRAMS if any(sign <= present for sign in item.signs)), None)
 
 

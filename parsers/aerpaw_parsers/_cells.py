@@ -97,7 +97,7 @@ def streams(
     # stable, so that the second of two readings of a row is flagged cell_twice
     table = table[np.isfinite(table["rsrp_dbm"].to_numpy(np.float64))].sort_values("row", kind="stable")
     table = table.assign(served=_serving(table), pci=table["pci"].where(table["pci"] >= 0, -1.0))
-    per_cell: list[Stream] = []
+    per_cell, named = list[Stream](), bool(table["more"].ne("").any())
     for key, cell_rows in table.groupby(["rat", "pci"]):
         rat, identity = cast("tuple[str, float]", key)
         carriers = np.unique(cell_rows["arfcn"].dropna()).tolist()
@@ -112,7 +112,7 @@ def streams(
             words = [rat, f"pci{about['pci']}" if identity >= 0 else level]
             words += [level] if identity >= 0 and level != "rsrp" else []
             words += [f"arfcn{about['arfcn']}"] if several and np.isfinite(carrier) else []
-            for further, part in of_carrier.groupby("more"):
+            for further, part in of_carrier.groupby("more") if named else [("", of_carrier)][: len(of_carrier)]:
                 name = "_".join(word for word in (*words, str(further)) if word)
                 known = {**about, **(more or {}).get(str(further), {}), "source": source}
                 per_cell.append(_stream(rows, part, name, known))

@@ -39,9 +39,9 @@ def _sniffer(entry: Mapping[str, Any]) -> Callable[[bytes], bool]:
             bool(head.strip())
             and all(_IS[name](head) for name in entry.get("is", ()))
             and not any(_IS[name](head) for name in entry.get("is_not", ()))
+            and ("mostly" not in entry or mostly(head, re.compile(entry["mostly"].encode("latin-1"))))
             and all(map(has, entry.get("has", ())))
             and not any(map(has, entry.get("lacks", ())))
-            and ("mostly" not in entry or mostly(head, re.compile(entry["mostly"].encode("latin-1"))))
         )
 
     return sniff

@@ -10,16 +10,16 @@ of tables:
   at least 92 % for errors over place. If chance can explain a deviation (Wilson interval), :data:`NEAR` times as many
   flights are simulated. The ratio of widths should be at most 1.5 from 20 correlation times per flight, and at most 3
   for offsets over place.
-* Two models over ten channels (4 dB): false verdicts on equal models, whose errors are random or whose predictions
-  differ along a route. Power if the difference is 0.3 dB, and that of a test that knows the spread. Share of flights
-  on which a channel is called better or worse, corrected for the number of channels. Share of verdicts if one model
-  is right.
+* Two models over ten channels (4 dB): false verdicts on equal models, whose errors are random, partly common to all
+  channels, or common with noise of each channel, or whose predictions differ along a route. Power if the difference is
+  0.3 dB, and that of a test that knows the spread (from :data:`KNOWN` other flights). Share of flights on which a
+  channel is called better or worse, corrected for the number of channels. Share of verdicts if one model is right.
 
 The weights are fitted to the kinds of the tables "level", "place" and "pooled". "between" and "place-between" have
-other kinds. In "loud", the error is two to five times larger for a sixth of the flight, and the column "not stationary"
-is the share of flights for which the tool reports this. Ranks come from thresholds on two
-processes. ``--only sample`` redraws the levels of the sample flight about its replay, with the noise of its plan, and
-prints the share of draws whose verdict against the best baseline is significant.
+other kinds. In "unlike", channels have different correlations. In "loud", the error is two to five times larger for a
+sixth of the flight, and the column "not stationary" is the share of flights for which the tool reports this. Ranks come
+from thresholds on two processes. ``--only sample`` redraws the levels of the sample flight about its replay, with the
+noise of its plan, and prints the share of draws whose verdict against the best baseline is significant.
 
     python benchmarks/coverage_of_intervals.py [--flights 200] [--quick] [--seed 0] [--only TABLE ...] [--figure PNG]
 
@@ -56,6 +56,7 @@ from aerpaw_cmp.jobs.flight_run import run_flight
 SHADOW_DB, CHANNELS, APART_DB = 4.0, 10, 0.3
 CUTS = np.array([-0.8, 0.5, 1.6])
 ASKED, FALSE, NEAR, SEED = (0.92, 0.97), 0.06, 8, 0
+KNOWN = 1500
 
 
 def flown(route: str, n: int) -> FloatArray:
@@ -87,7 +88,7 @@ class Shadowing:
 
     ``roots`` are those of the autoregression. ``noise`` is the standard deviation of white noise relative to the rest.
     The share ``placed`` of the variance is correlated over ``length_m`` along a ``route``. A sixth of the flight is
-    ``loud`` times as large.
+    ``loud`` times as large. The channels of a pooled comparison are of this kind and those ``beside`` it, in turn.
     """
 
     n: int
@@ -99,6 +100,7 @@ class Shadowing:
     length_m: float = 0.0
     placed: float = 1.0
     loud: float = 1.0
+    beside: tuple["Shadowing", ...] = ()
 
     def __str__(self) -> str:
         kind = {0: "white", 1: "AR(1)", 2: "AR(2)"}[len(self.roots)] if self.by_time else "place"
@@ -108,7 +110,12 @@ class Shadowing:
         parts += [self.route] if self.route else []
         parts += [f"{self.length_m:g} m"] if self.length_m else []
         parts += [f"loud {self.loud:g}"] if self.loud != 1.0 else []
-        return ", ".join([*parts, *([self.spacing] if self.spacing != "even" else [])])
+        parts += [self.spacing] if self.spacing != "even" else []
+        return " beside ".join([", ".join(parts), *(str(other).partition(": ")[2] for other in self.beside)])
+
+    def of(self, channel: int) -> "Shadowing":
+        """Return the kind of a channel."""
+        return (self, *self.beside)[channel % (1 + len(self.beside))]
 
     @property
     def by_time(self) -> float:
@@ -239,11 +246,21 @@ LOUD = tuple(
     + [Shadowing(400, (), 0.4, route=route, length_m=50.0, loud=5.0) for route in ("lawnmower", "waypoints")]
     + [Shadowing(400, (0.9,), loud=loud) for loud in (2.0, 3.0)]
 )
+WAYS = (0.98, 0.95, 0.9, 0.8, 0.5)
+# Channels of different kinds: white noise as loud as slow errors or twice as loud, many correlation times, two lengths.
+UNLIKE = (
+    Shadowing(600, (0.98,), beside=(Shadowing(600),)), Shadowing(600, (0.98,), beside=(Shadowing(600, (), 1.73),)),
+    Shadowing(600, (WAYS[0],), beside=(*(Shadowing(600, (r,)) for r in WAYS[1:]), Shadowing(600))),
+    Shadowing(400, (), 0.4, route="lawnmower", length_m=150.0,
+              beside=(Shadowing(400, (), 0.4, route="lawnmower", length_m=20.0),)),
+    Shadowing(400, (), 0.4, route="orbit", length_m=70.0, beside=(Shadowing(400, (0.5,)),)),
+)  # fmt: skip
 POOLED_PLACE = tuple(
     [Shadowing(n, (), 0.4, route=route, length_m=length) for route in ("lawnmower", "waypoints")
      for n, length in ((400, 50.0), (400, 100.0), (400, 150.0), (1200, 50.0), (1200, 150.0))
      if route == "lawnmower" or length < 6.0 * np.sqrt(n)]
     + [Shadowing(400, (), 0.4, route=route, length_m=70.0) for route in ("orbit", "radial", "hover")]
+    + [Shadowing(1000, (), 0.4, route=route, length_m=70.0) for route in ("orbit", "radial")]
     + [Shadowing(400, (0.9,), 0.3, route="lawnmower", length_m=80.0, placed=0.5)]
     + [Shadowing(1000, (r,), 0.0, route="lawnmower") for r in (0.0, 0.9, 0.95)]
 )  # fmt: skip
@@ -264,10 +281,9 @@ def shadowed_pair(
     """
     both = [shadowing.sequences(rng, count) for _ in range(2)] if shared else [0.0, 0.0]
     columns = []
-    for _ in range(channels):
-        own, other = (
-            np.sqrt(shared) * common + np.sqrt(1.0 - shared) * shadowing.sequences(rng, count) for common in both
-        )
+    for channel in range(channels):
+        kind = shadowing.of(channel)
+        own, other = (np.sqrt(shared) * common + np.sqrt(1.0 - shared) * kind.sequences(rng, count) for common in both)
         columns.append((larger * own, 0.5 * own + np.sqrt(0.75) * other))
     return _together(columns)
 
@@ -282,9 +298,15 @@ def routed_pair(
         apart = 0.5 * sum(
             route.normal() * np.sin(k * phase + route.uniform(0.0, 6.0)) / np.sqrt(k) for k in (1, 2, 3, 5, 8, 13, 21)
         )
-        noise = shadowing.sequences(rng, count)
+        noise = shadowing.of(channel).sequences(rng, count)
         columns.append((b * apart + noise, (b - 1.0) * apart + noise))
     return _together(columns)
+
+
+def noisy_pair(rng: np.random.Generator, shadowing: Shadowing, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return errors of two models that all channels have in common, and white noise as large in each channel."""
+    common, noise = shadowed_pair(rng, shadowing, count, shared=1.0), shadowed_pair(rng, Shadowing(shadowing.n), count)
+    return common[0] + noise[0], common[1] + noise[1]
 
 
 def _together(columns: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
@@ -347,8 +369,10 @@ def pooled_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
     def decided(pairs: list[PairedDifference]) -> float:
         return float(np.mean([pair.verdict in ("better", "worse") for pair in pairs]))
 
-    equal = shadowed_pair(rng, shadowing, flights)
-    known = 1.96 * np.std([pair.mean_square_difference_db2 for pair in pooled(equal)])
+    equal, others = shadowed_pair(rng, shadowing, flights), np.random.default_rng([SEED + 1, shadowing.n])
+    # the spread comes from other flights, without intervals
+    apart = [(a * a - b * b).mean(axis=1) for a, b in (shadowed_pair(others, shadowing, KNOWN // 5) for _ in range(5))]
+    known = 1.96 * SHADOW_DB**2 * np.std(apart)
     size = np.sqrt(1.0 + shadowing.noise**2)
     better = pooled(shadowed_pair(rng, shadowing, flights, larger=1.0 + APART_DB / SHADOW_DB / size))
     right = pooled(routed_pair(rng, shadowing, flights, CHANNELS, 0.0))
@@ -364,6 +388,7 @@ def pooled_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
         "power": decided(better),
         "power_known": float(np.mean([abs(pair.mean_square_difference_db2) > known for pair in better])),
         "right_decided": decided(right),
+        "false_noise": decided(pooled(noisy_pair(rng, shadowing, flights))),
         "any_channel": float(np.mean([any(pair.verdict in ("better", "worse") for pair in row) for row in by_channel])),
     }
 
@@ -450,7 +475,7 @@ def judge(rows: list[dict[str, object]]) -> None:
 
 def judge_verdicts(rows: list[dict[str, Any]], flights: int) -> None:
     """Print the kinds with too many false verdicts beyond chance, and those with less than 60 % of the power."""
-    for name in ("false", "false_shared", "false_route"):
+    for name in ("false", "false_shared", "false_route", "false_noise"):
         sure = [row["flight"] for row in rows if wilson(row[name], flights)[0] > FALSE]
         print(f"{name}: at most {100 * max(row[name] for row in rows):.1f} %; above 6 % beyond chance: {sure or 0}")
     weak = [(row["flight"], round(row["power"] / row["power_known"], 2)) for row in rows
@@ -495,7 +520,7 @@ def show(rows: list[dict[str, object]]) -> None:
 TABLES = {
     "level": (level_cell, GRID), "between": (level_cell, BETWEEN), "place": (level_cell, PLACE),
     "place-between": (level_cell, PLACE_BETWEEN), "loud": (level_cell, LOUD), "pooled": (pooled_cell, POOLED),
-    "pooled-place": (pooled_cell, POOLED_PLACE),
+    "pooled-place": (pooled_cell, POOLED_PLACE), "unlike": (pooled_cell, UNLIKE),
     "rank": (rank_cell, [*(Shadowing(n, (float(np.exp(-1.0 / m)),)) for n, m in ((1500, 5.0), (3000, 30.0))),
                          *(Shadowing(n, (), 0.4, route=route, length_m=50.0)
                            for n, route in ((1000, "lawnmower"), (400, "waypoints")))]),

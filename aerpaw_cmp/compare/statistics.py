@@ -11,6 +11,7 @@ widened or narrowed, depending on the correlations that the sequence shows. Weig
 simulation (``benchmarks/interval_weights.py``).
 
 Statistics of ranks and of paired models are means of contributions of the samples, so they have the same intervals.
+Comparisons over all channels of a flight also learn the correlation from each channel (:class:`Channels`).
 
 Passes over the same positions are compared for every pair of flights: 199 000 pairs for 200 flights with ten links. The
 positions of a flight are therefore put into one k-d tree, pairs whose boxes are apart are not searched, and
@@ -52,6 +53,9 @@ _SMOOTH_FLOOR = 1e-7
 
 Kind = Literal["mean", "power", "ratio", "influence"]
 
+# Positions (n, 3) of samples: east, north and up [m], NaN if unknown. None if no sample has a position.
+Track = FloatArray | None
+
 # Correlation lengths, divided by the root mean square distance of a track from its centre. Consecutive lengths have a
 # ratio of the root of 2, because the square of a correlation is the correlation with half its length.
 LENGTHS = 0.06 * 2.0 ** (0.5 * np.arange(12))
@@ -74,6 +78,18 @@ _THINNED = 400
 # Only correlation over time is used if more than this share of samples has no position, or if the RMS distance from the
 # centre of the track is below this [m]: the logged positions of a hover are noise.
 _UNPLACED, _HOVER_M = 0.1, 15.0
+
+# Part of the slow fluctuations of pooled channels that is white or ten times faster, because channels differ in their
+# correlation.
+_SECOND_PART = 0.3
+
+# Smallest rate of a correlation with white noise that channels can show. With slower ones, no term would exceed the
+# noise, but the mean would vary.
+_VISIBLE = 6.0
+
+# Number of bins of a pooled sequence for the terms of its channels, and standard deviation of the logarithm of the
+# power of a sum of independent channels, relative to the sum of their powers. It is 0.2 for a known correlation.
+_BINS, _SUM_OF_POWERS = 1024, 0.3
 
 # File with logarithms of the weights in tenths, by kind, form (exponential with each white share, then smooth) and
 # rate, and with the widening of the draws in hundredths, per weighted share of each correlation and per unweighted
@@ -146,15 +162,26 @@ def time_correlations(terms: int = TERMS) -> CorrelationSet:
     return CorrelationSet.of(np.array(covariances))
 
 
-def place_correlations(place_m: FloatArray, terms: int = TERMS) -> CorrelationSet | None:
+@cache
+def _two_parts(terms: int) -> CorrelationSet:
+    """Return exponential correlations at all :data:`RATES` with a second part: white, then ten times faster."""
+    slow, fast = ([0.5 * by * rate * _exponential(by * rate, terms).real for rate in RATES] for by in (1.0, 10.0))
+    both = [*zip(slow, [np.eye(terms + 1)] * len(RATES), strict=True), *zip(slow, fast, strict=True)]
+    return CorrelationSet.of(np.array([(1.0 - _SECOND_PART) * first + _SECOND_PART * other for first, other in both]))
+
+
+def place_correlations(place_m: Track, terms: int = TERMS, centred: bool = False) -> CorrelationSet | None:
     """Return the distributions for errors that are correlated over position.
 
     Parameters
     ----------
-    place_m : (n, 3)
+    place_m : (n, 3) or None
         East, north and up of each sample, in time order; NaN if unknown [m].
     terms : int
         Number of cosine terms.
+    centred : bool
+        True for differences of squares of errors about their mean. Such errors are anticorrelated at a distance, so
+        their squares are correlated everywhere, which changes the mean and no cosine term.
 
     Returns
     -------
@@ -167,17 +194,17 @@ def place_correlations(place_m: FloatArray, terms: int = TERMS) -> CorrelationSe
     The terms of errors with covariance K are T K T', where row k of T is the k-th cosine over the number of samples.
     K is exp(-|p_i - p_j| / L) (Gudmundson 1991), formed from every m-th position.
     """
-    if only_time(place_m):
+    if place_m is None or only_time(place_m):
         return None
     known = np.flatnonzero(np.isfinite(place_m).all(axis=1))
     step = -(-len(known) // _THINNED)
     at = known[step // 2 :: step]
-    return _place_correlations(place_m[at].tobytes(), ((at + 0.5) / len(place_m)).tobytes(), terms)
+    return _place_correlations(place_m[at].tobytes(), ((at + 0.5) / len(place_m)).tobytes(), terms, centred)
 
 
 # Channels and models of a flight share its track; each entry takes 4 MB.
 @lru_cache(maxsize=8)
-def _place_correlations(positions: bytes, instants: bytes, terms: int) -> CorrelationSet:
+def _place_correlations(positions: bytes, instants: bytes, terms: int, centred: bool) -> CorrelationSet:
     place, instant = np.frombuffer(positions).reshape(-1, 3), np.frombuffer(instants)
     place = place - place.mean(axis=0)
     square = np.square(place).sum(axis=1)
@@ -188,8 +215,9 @@ def _place_correlations(positions: bytes, instants: bytes, terms: int) -> Correl
     for longest in (len(LENGTHS) - 1, len(LENGTHS) - 2):
         correlation = np.exp(-apart / LENGTHS[longest])
         for at in range(longest, -1, -2):
-            by_length[at] = cosines @ correlation @ cosines.T
-            beyond[at] = max((1.0 - correlation.mean()) / np.trace(by_length[at][1:, 1:]) - 1.0, 0.0)
+            used = np.square(_about_mean(np.sqrt(correlation))) if centred else correlation
+            by_length[at] = cosines @ used @ cosines.T
+            beyond[at] = max((1.0 - used.mean()) / np.trace(by_length[at][1:, 1:]) - 1.0, 0.0)
             correlation = np.square(correlation)
             freedom[at] = 1.0 / correlation.mean()
     placed = np.array([_unit(by_length[at]) for at in range(len(LENGTHS))])
@@ -203,12 +231,18 @@ def _place_correlations(positions: bytes, instants: bytes, terms: int) -> Correl
     )
 
 
+def _about_mean(covariance: FloatArray) -> FloatArray:
+    """Return the covariance of values minus their mean."""
+    mean = covariance.mean(axis=0)
+    return np.asarray(covariance - mean - mean[:, None] + mean.mean())
+
+
 def _unit(covariance: FloatArray) -> FloatArray:
     """Scale a covariance of mean and terms to a power of 1 of the terms."""
     return np.asarray(covariance / np.trace(covariance[1:, 1:]))
 
 
-def only_time(place_m: FloatArray | None) -> str:
+def only_time(place_m: Track) -> str:
     """Return the reason why intervals use only correlation over time, or an empty text if they also use position.
 
     Parameters
@@ -298,10 +332,10 @@ class WeightedCorrelations:
         return np.concatenate([getattr(part, name) for part in self.parts])
 
 
-def weighted_correlations(kind: Kind, terms: int, place_m: FloatArray | None = None) -> WeightedCorrelations:
+def weighted_correlations(kind: Kind, terms: int, place_m: Track = None) -> WeightedCorrelations:
     """Return the correlations over time, and over place if positions (n, 3) [m] allow it, with their weights."""
     over_time, weight, stretch = time_correlations(terms), weights(kind), stretches(kind)
-    over_place = None if place_m is None else place_correlations(place_m, terms)
+    over_place = place_correlations(place_m, terms)
     if over_place is None:
         return WeightedCorrelations((over_time,), weight, stretch)
     size, longest = _PLACE_WEIGHT[kind]
@@ -309,6 +343,53 @@ def weighted_correlations(kind: Kind, terms: int, place_m: FloatArray | None = N
     placed = np.tile(by_length, len(over_place.power) // len(LENGTHS))
     usual = np.repeat([[1.0], [0.0]], len(placed), axis=1)
     return WeightedCorrelations((over_time, over_place), np.concatenate([weight, placed]), np.hstack([stretch, usual]))
+
+
+@dataclass(frozen=True, slots=True)
+class Channels:
+    """The channel (n,) of each sample of a pooled sequence, and whether errors are about the mean of their channel.
+
+    Channels are numbered from 0.
+    """
+
+    number: IntArray
+    centred: bool
+
+    def weighted(self, values: FloatArray, known: WeightedCorrelations, place_m: Track) -> WeightedCorrelations:
+        """Return correlations with weights for a pooled sequence (n,), from those for a single sequence.
+
+        The terms of the sequence are the sum of the terms of its channels. If channels are independent, the outer
+        products of the terms of each channel add up to the covariance of the sum on average, even if the channels have
+        different correlations, powers or numbers of samples. Their likelihood then counts like that of several
+        sequences, whose number follows from the powers and correlations of the channels. But channels with common
+        fading and noise of their own are not like their sum. Therefore the weights are a mixture of these likelihoods
+        and of the weights for a single sequence. The odds are low if the power of the sum is not the sum of the powers.
+        """
+        from scipy.fft import dct
+
+        n, count, terms = len(values), int(self.number.max()) + 1, known.parts[0].slope.shape[1]
+        bins = min(n, _BINS)
+        at = self.number * bins + np.arange(n) * bins // n
+        every = dct(np.bincount(at, values - values.mean(), count * bins).reshape(count, bins), norm="ortho")
+        slow = every[:, 1 : terms + 1]
+        common = slow @ slow.T
+        further = max(float(np.trace(common) ** 2 / max(np.square(common).sum(), 1e-300)) - 1.0, 0.0)
+        placed = place_correlations(place_m, terms, self.centred)
+        joined = replace(known, parts=(*known.parts, _two_parts(terms), *([placed] if placed else [])))
+        square = np.maximum(likelihoods(np.vstack([slow, slow.sum(axis=0)]), joined.parts)[1], 1e-300)
+        each, whole = square[:-1].sum(axis=0), square[-1]
+        log = joined.joined("log_det") - 0.5 * terms * np.log(each)
+        every, fast = np.ones(len(RATES)), np.where(RATES > _VISIBLE, 1.0, 0.0)
+        over_time = [fast if share else every for share in WHITE_SHARES]
+        over_place = known.weights[len(known.parts[0].power) :]  # as in ``placed``, but not used there
+        over_place = over_place / over_place.max(initial=1e-300)
+        prior = np.concatenate([*over_time, every, 0.0 * over_place, fast, every, over_place])
+        shown = prior * np.exp(further * (log - log.max()))
+        shown /= max(float(shown.sum()), 1e-300)
+        odds = further * np.exp(-0.5 * (shown @ np.log(whole / each) / _SUM_OF_POWERS) ** 2)
+        weight = odds * shown
+        weight[: len(known.weights)] += known.weights / known.weights.sum()
+        return replace(joined, weights=weight, stretches=np.repeat([[1.0], [0.0]], len(weight), axis=1))
 
 
 def likelihoods(slow: FloatArray, parts: Sequence[CorrelationSet] = ()) -> tuple[FloatArray, FloatArray]:
@@ -367,7 +448,9 @@ def memory_share(values: FloatArray) -> float:
     return float(1.0 / np.tile(RATES, len(WHITE_SHARES) + 1)[int(np.argmax(likelihood * weights("power")))])
 
 
-def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | None = None) -> FloatArray:
+def mean_draws(
+    values: FloatArray, kind: Kind = "mean", place_m: Track = None, of: Channels | None = None
+) -> FloatArray:
     """Return draws of the mean of the process minus the mean of the sequence.
 
     Parameters
@@ -378,11 +461,19 @@ def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | No
         Kind of the values: errors, differences of their squares, or contributions of samples to a statistic.
     place_m : (n, 3), optional
         East, north and up of each sample [m], NaN if unknown. With positions, correlation over position is also used.
+    of : Channels, optional
+        Channels of a pooled sequence of differences of squares.
+
+    Returns
+    -------
+    (draws,)
     """
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
     slow = cosine_terms(values).slow
     known = weighted_correlations(kind, len(slow), place_m)
+    if of is not None and of.number.any():
+        known = of.weighted(values, known, place_m)
     index, scale, stretch = _picked(slow, known)
     centre = -(known.joined("slope") @ slow)[index]
     reach = np.sqrt(scale * known.joined("variance")[index]) * _random(len(slow))[2]
@@ -431,7 +522,7 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
     return (share, ratio) if ratio > _LOUD else (0.0, 1.0)
 
 
-def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatArray:
+def power_draws(values: FloatArray, place_m: Track = None) -> FloatArray:
     """Return draws of the expected variance of sequences with this length and spacing.
 
     Draws have the order of :func:`mean_draws`. A correlation longer than the sequence affects only its mean.
@@ -484,7 +575,7 @@ Interval = tuple[float, float]
 NO_INTERVAL: Interval = (float("nan"), float("nan"))
 
 
-def independent_samples(values: FloatArray, place_m: FloatArray | None = None) -> float:
+def independent_samples(values: FloatArray, place_m: Track = None) -> float:
     """Return the number of independent samples whose mean would be as accurate as that of the sequence.
 
     Parameters
@@ -531,9 +622,7 @@ class ErrorIntervals:
     notes: tuple[str, ...] = ()
 
 
-def error_intervals(
-    measured_db: FloatArray, simulated_db: FloatArray, place_m: FloatArray | None = None
-) -> ErrorIntervals:
+def error_intervals(measured_db: FloatArray, simulated_db: FloatArray, place_m: Track = None) -> ErrorIntervals:
     """Compute the intervals of offset (mean difference), RMSE about it, and correlation of the process of a flight.
 
     Parameters
@@ -561,7 +650,7 @@ def error_intervals(
     )
 
 
-def _notes(values: FloatArray, place_m: FloatArray | None) -> Iterator[str]:
+def _notes(values: FloatArray, place_m: Track) -> Iterator[str]:
     """Yield sentences about the limits of the intervals of a sequence (n,)."""
     if place_m is not None and (reason := only_time(place_m)):
         yield f"The intervals consider correlation over time only: {reason}."
@@ -573,7 +662,7 @@ def _notes(values: FloatArray, place_m: FloatArray | None) -> Iterator[str]:
         )
 
 
-def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, place_m: FloatArray | None) -> Interval:
+def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, place_m: Track) -> Interval:
     """Return the interval of the correlation for a fixed route: slope and rest of the measurement are random."""
     s, m = simulated_db - simulated_db.mean(), measured_db - measured_db.mean()
     spread = float(s @ s) / len(s)
@@ -585,7 +674,7 @@ def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, pla
     return _around(correlation(measured_db, simulated_db), along / np.sqrt(along**2 + power_draws(residual, place_m)))
 
 
-def mean_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
+def mean_interval(values: FloatArray, place_m: Track = None) -> Interval:
     """Return the 95 % interval of the mean of the process that a sequence (n,) in time order comes from.
 
     Errors may be correlated over the positions ``place_m`` (n, 3) [m] as well, as for :func:`mean_draws`.
@@ -597,10 +686,7 @@ def mean_interval(values: FloatArray, place_m: FloatArray | None = None) -> Inte
 
 
 def influence_interval(
-    estimate: float,
-    influence: FloatArray,
-    place_m: FloatArray | None = None,
-    bounds: tuple[float, float] = (-np.inf, np.inf),
+    estimate: float, influence: FloatArray, place_m: Track = None, bounds: Interval = (-np.inf, np.inf)
 ) -> Interval:
     """Return the 95 % interval of a statistic of a sequence.
 
@@ -632,7 +718,7 @@ def influence_interval(
     return float(low), float(high)
 
 
-def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
+def spread_interval(values: FloatArray, place_m: Track = None) -> Interval:
     """Return the 95 % interval of the standard deviation of a correlated sequence (n,) in time order.
 
     If the interval is wider than :data:`_BOUND` times the value, its upper end is infinite, so that it is a lower
@@ -644,7 +730,7 @@ def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> In
     return low, np.inf if high - low > _BOUND * values.std() else high
 
 
-def rmse_interval(residual: FloatArray, rmse: float, place_m: FloatArray | None = None) -> Interval:
+def rmse_interval(residual: FloatArray, rmse: float, place_m: Track = None) -> Interval:
     """Return the 95 % interval of the root mean square of residuals (n,) in time order, whose value is ``rmse``.
 
     The residuals have a mean if the offset is on a grid, at the edge of its range or fitted with a floor. The mean
@@ -745,8 +831,9 @@ _ROUNDING_DB = 1e-9
 
 
 def paired_difference(
-    error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True, place_m: FloatArray | None = None
-) -> PairedDifference:
+    error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True, place_m: Track = None,
+    of: Channels | None = None,
+) -> PairedDifference:  # fmt: skip
     """Compare two models on the same samples by the difference of their mean square errors.
 
     Parameters
@@ -758,6 +845,8 @@ def paired_difference(
         which are used unchanged.
     place_m : (n, 3), optional
         The same as in :func:`mean_draws`.
+    of : Channels, optional
+        Channels of all samples, if those of several channels are compared at once. Then no sample is NaN.
 
     Returns
     -------
@@ -788,7 +877,7 @@ def paired_difference(
     bounds, squares, spread, chance = NO_INTERVAL, NO_INTERVAL, nan, 1.0
     if len(first) >= FEWEST:
         places = None if place_m is None else place_m[finite]
-        drawn = square - other_square + mean_draws(undecided(first, second), "ratio", places)
+        drawn = square - other_square + mean_draws(undecided(first, second), "ratio", places, of)
         low, high = np.quantile(drawn, [0.025, 0.975])
         squares = float(low), float(high)
         scale = max(rmse + other_rmse, 1e-300)
@@ -844,7 +933,7 @@ def pooled_difference(
     -------
     PairedDifference
         Comparison of the root mean square errors over all samples. Samples of all channels are in time order, so that
-        common fading of the channels counts once.
+        common fading of the channels counts once. The channels also show the correlation (:class:`Channels`).
     """
     parts = []
     for at, (time, error, other) in enumerate(channels):
@@ -857,7 +946,9 @@ def pooled_difference(
         return paired_difference([], [])
     time, first, second, place = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(time, kind="stable")
-    return paired_difference(first[order], second[order], free_offset=False, place_m=place[order])
+    number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])[order]
+    of = Channels(number, free_offset)
+    return paired_difference(first[order], second[order], free_offset=False, place_m=place[order], of=of)
 
 
 def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | None = None) -> list[PairedDifference]:
@@ -886,9 +977,7 @@ def paired_verdict(low: float, high: float) -> Literal["better", "worse", "not s
     return "better" if high < 0 else "worse" if low > 0 else "not significant"
 
 
-def share_interval(
-    indicator: FloatArray, place_m: FloatArray | None = None, sequence: FloatArray | None = None
-) -> Interval:
+def share_interval(indicator: FloatArray, place_m: Track = None, sequence: FloatArray | None = None) -> Interval:
     """Return the 95 % interval of a share, such as a bar of a histogram.
 
     Parameters

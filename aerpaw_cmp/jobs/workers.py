@@ -39,6 +39,9 @@ from .tasks import code_digest
 # A function of one item that can be pickled.
 Task = Callable[[Any], Any]
 
+# The items of all tasks, by number.
+_Items = Sequence[Any]
+
 # A function that receives the number of an item and the result of its task, or :class:`Lost`.
 _OnResult = Callable[[int, Any], None]
 
@@ -65,12 +68,10 @@ class Workers(ABC):
         """The number of tasks that run at the same time."""
 
     @abstractmethod
-    def _run_waiting(
-        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
-    ) -> list[int]:
+    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
         """Run waiting items by number until a worker ends. Return the numbers of the tasks that ended with it."""
 
-    def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:
+    def run(self, function: Task, items: _Items, on_result: _OnResult) -> None:
         """Run a function on every item, in any order.
 
         Parameters
@@ -112,9 +113,7 @@ class InProcess(Workers):
 
     count = 1
 
-    def _run_waiting(
-        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
-    ) -> list[int]:
+    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
         while waiting:
             number = waiting.popleft()
             on_result(number, function(items[number]))
@@ -132,9 +131,7 @@ class Processes(Workers):
         """The number of processes."""
         return self._count
 
-    def _run_waiting(
-        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
-    ) -> list[int]:
+    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
         active: dict[Future[Any], int] = {}
         others = multiprocessing.active_children()  # processes that the calling program started itself
         with _in_trusted_folder() as folder:
@@ -216,9 +213,7 @@ class Cluster(Workers):
         except OSError:
             raise self._scheduler_lost() from None
 
-    def _run_waiting(
-        self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult
-    ) -> list[int]:
+    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
         killed: list[int] = []
         active = {self._client.submit(function, items[number], pure=False): number for number in waiting}
         waiting.clear()

@@ -83,6 +83,78 @@ def test_the_channels_of_a_flight_are_one_test():
     assert statistics.pooled_difference([]).verdict == "no interval"
 
 
+def width(channels, **options):
+    """Return the widths of the interval over all channels, and over the same samples as a single sequence."""
+    pooled = statistics.pooled_difference(channels, **options)
+    order = np.argsort(np.concatenate([time for time, *_ in channels]), kind="stable")
+    errors = (np.concatenate([e[at] - e[at].mean() for e in channels])[order] for at in (1, 2))
+    places = options.get("place_m")
+    place = None if places is None else np.concatenate(places)[order]
+    single = paired_difference(*errors, free_offset=False, place_m=place)
+    return np.ptp(pooled.mean_square_ci95_db2), np.ptp(single.mean_square_ci95_db2)
+
+
+def test_independent_channels_show_the_correlation_of_their_sum():
+    """Ten channels of 300 samples with 15 correlation times: the interval is narrower than for a single sequence."""
+    rng, time = np.random.default_rng(31), np.arange(300.0)
+    flights = [[(time, *(shadowing(rng, 300, 20, 4.0) for _ in range(2))) for _ in range(10)] for _ in range(12)]
+    narrower = [pooled / single for pooled, single in map(width, flights)]
+    assert np.median(narrower) < 0.85
+    alone = [width(channels[:1]) for channels in flights]
+    assert all(pooled == single for pooled, single in alone)
+
+
+def test_channels_that_are_not_independent_add_nothing():
+    """Copies, common fading with noise of each channel, and a channel of few samples: as for a single sequence."""
+    rng, time = np.random.default_rng(32), np.arange(400.0)
+    a, b = (shadowing(rng, 400, 30, 4.0) for _ in range(2))
+    pooled, single = width([(time + 1e-3 * k, a, b) for k in range(5)])
+    assert pooled == pytest.approx(single, rel=1e-6)
+    noisy = [(time, *(e + rng.normal(0.0, 4.0, 400) for e in (a, b))) for _ in range(10)]
+    pooled, single = width(noisy)
+    assert pooled == pytest.approx(single, rel=0.02)
+    pooled, single = width([(time, a, b), (time[::50], *rng.normal(0.0, 1.0, (2, 8)))])
+    assert pooled == pytest.approx(single, rel=0.02)
+
+
+def test_products_of_errors_about_their_mean_are_correlated_at_any_distance():
+    """Four rounds of a circle, errors over 0.96 times its diameter: by simulation, then as terms of the products."""
+    rng, angle = np.random.default_rng(33), np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    place = 150.0 * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    covariance = np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / 288.0)
+    first, second = (rng.normal(size=(40_000, 60)) @ np.linalg.cholesky(covariance).T for _ in range(2))
+    products = (first - first.mean(axis=1, keepdims=True)) * (second - second.mean(axis=1, keepdims=True))
+    expected = np.square(statistics._about_mean(covariance))
+    np.testing.assert_allclose(np.cov(products.T), expected, atol=0.06 * expected.max())
+    known = statistics.place_correlations(np.tile(place, (4, 1)), 24, centred=True)
+    cosines = np.cos(np.pi * np.outer(np.arange(25), (np.arange(240) + 0.5) / 240))
+    cosines[1:] *= np.sqrt(2.0)
+    terms = cosines @ np.tile(expected, (4, 4)) @ cosines.T
+    share = statistics.PLACE_WHITE[0]
+    mixed = (1.0 - share) * terms / np.trace(terms[1:, 1:]) + share * np.eye(25) / 24
+    slope = np.linalg.solve(mixed[1:, 1:], mixed[0, 1:])
+    # the eighth length is 0.96 times the root mean square distance, half of the length of the errors
+    assert known.variance[8] == pytest.approx(mixed[0, 0] - slope @ mixed[0, 1:])
+
+
+def test_channels_of_different_length_time_and_place():
+    """Channels with gaps, other rates and missing positions still have an interval, also from held-out errors."""
+    rng = np.random.default_rng(34)
+    channels, places = [], []
+    for step, start in ((1, 0), (3, 100), (40, 0)):
+        time = np.arange(start, 600, step, dtype=float)
+        first, second = rng.normal(size=(2, len(time)))
+        first[: len(time) // 5] = np.nan
+        channels.append((time, first, second))
+        place = np.column_stack([10.0 * time, 20.0 * np.sin(time), 0.0 * time])
+        places.append(np.where(rng.random(len(time))[:, None] < 0.05, np.nan, place))
+    for free in (True, False):
+        pair = statistics.pooled_difference(channels, place_m=places, free_offset=free)
+        low, high = pair.mean_square_ci95_db2
+        assert low < pair.mean_square_difference_db2 < high
+        assert pair.n == sum(np.isfinite(first).sum() for _, first, _ in channels)
+
+
 def test_verdicts_of_channels_are_corrected_for_their_number():
     """Holm by hand at 0.02: 0.004 x 4 and 0.006 x 3 stay, 0.012 x 2 does not, nor what comes behind it."""
     pair = paired_difference(np.arange(30.0), 2.0 * np.arange(30.0))

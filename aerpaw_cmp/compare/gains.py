@@ -72,8 +72,7 @@ def link_directions(tower_m: FloatArray, position_m: FloatArray, rotation: Float
 
 def rotated(direction: FloatArray, turn_deg: float) -> FloatArray:
     """Return directions (..., 3) in the body frame, rotated counter-clockwise about its vertical axis."""
-    c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
-    return np.asarray(direction @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+    return np.asarray(direction @ turned(turn_deg).T)
 
 
 @dataclass(frozen=True, slots=True)

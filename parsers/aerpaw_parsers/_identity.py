@@ -289,8 +289,10 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     meaning = sheet.meanings[column]
     zero = meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(_COUNTED)
     texts = sheet.texts(column)
-    # 'lw1', 'LW1' and 'LW-1' are one tower
+    # 'lw1', 'LW1' and 'LW-1' are one tower, '3510 MHz' and '3.51 GHz' one carrier
     plain = {text: re.sub(r"(?<=[^\W\d])[-_ ](?=\d)", "", text.casefold()) for text in {*texts}}
+    carriers = {text: attributes_of({sheet.plain[column]: text}).get("frequency_hz") for text in plain}
+    plain |= {text: f"{hz:.9g}" for text, hz in carriers.items() if isinstance(hz, float)}
     spelling = {plain[text]: text for text in reversed(texts)}
     named = {text: spelling[plain[text]] if _is_identity(text, zero=zero) else "" for text in {*texts}}
     return [named[text] for text in texts]

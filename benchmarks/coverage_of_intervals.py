@@ -530,7 +530,7 @@ EVERY, QUICK = 3, 60
 
 
 def main() -> None:
-    global NEAR, SEED
+    global NEAR, SEED, KNOWN
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=200, help="simulated flights per cell")
     parser.add_argument("--quick", action="store_true", help="some kinds, few flights: at most 3 minutes")
@@ -541,7 +541,7 @@ def main() -> None:
     arguments = parser.parse_args()
     flights, every, SEED = arguments.flights, 1, arguments.seed
     if arguments.quick:
-        flights, every, NEAR = QUICK, EVERY, 1
+        flights, every, NEAR, KNOWN = QUICK, EVERY, 1, 5 * QUICK
     if arguments.only == ["sample"]:
         print(f"sample flight: better than the best baseline in {sample_verdicts(flights):.3f} of the draws")
         return

@@ -98,6 +98,7 @@ PATTERNS = {name: re.compile("".join(pieces)) for name, pieces in _FILE["pattern
 ZONES: Mapping[str, Mapping[str, Any]] = _FILE["zones"]
 HINTS: Mapping[str, Sequence[str]] = _FILE["hints"]
 FIXES: Mapping[str, str] = _FILE["fixes"]
+LIMITS: Mapping[str, Mapping[str, Sequence[str]]] = _FILE["limits"]
 # Hours east of UTC, and a zone with summer time, of each meaning of an ambiguous abbreviation.
 WINTER = {
     word: [(float(hours), zone) for zone, hours in meanings.items()] for word, meanings in ZONES["winter"].items()

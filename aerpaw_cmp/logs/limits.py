@@ -27,7 +27,8 @@ import pandas as pd
 from ..common.geodesy import rough_m
 from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from .records import COLUMNS, ReadResult, Stream
+from . import dictionary
+from .records import ReadResult, Stream
 
 FASTEST_MPS = 100.0
 FLAG, STALE = "position_jump", "position_stale"
@@ -260,16 +261,9 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArr
 # The flag of rows beyond a limit, and the smallest and largest possible value of each column [unit of its name]. The
 # columns of a flag become NaN together. Levels (by unit) and times have their own rules below.
 LIMITS: dict[str, dict[str, tuple[float, float]]] = {
-    "position_out_of_range": {
-        "latitude_deg": (-90.0, 90.0), "longitude_deg": (-180.0, 180.0), "altitude_m": (-1000.0, 20_000.0),
-    },
-    "attitude_out_of_range": {
-        "roll_deg": (-180.0, 180.0), "pitch_deg": (-180.0, 180.0), "yaw_deg": (-360.0, 360.0),
-    },
-    "velocity_out_of_range": dict.fromkeys(COLUMNS["telemetry"][6:9], (-200.0, 200.0)),
-    "rsrp_out_of_range": {"rsrp_dbm": (-200.0, 50.0)},
-    "sinr_out_of_range": {"sinr_db": (-100.0, 100.0)},
-}  # fmt: skip
+    flag: {name: (float(low), float(high)) for name, (low, high) in ranges.items()}
+    for flag, ranges in dictionary.LIMITS.items()
+}
 
 # Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight receives 30 dBm; a ratio to the noise is
 # wider.

@@ -268,8 +268,8 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
     return digest.hexdigest()
 
 
-# Code, and the tables that code reads: the dictionary of columns, and weights of the statistics.
-_SOURCES = ("**/*.py", "logs/*.yaml", "compare/*.json")
+# Code, and the tables that code reads: those of the parsers, the dictionary of columns, and weights of the statistics.
+_SOURCES = ("**/*.py", "*.yaml", "logs/*.yaml", "compare/*.json")
 
 
 @cache

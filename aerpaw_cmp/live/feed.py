@@ -41,7 +41,6 @@ _STEP_SHOWN_S = 30.0
 _STEP_S = 0.2
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
-PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
 # Errors that a record of unexpected content can raise. Such a record is not shown on the page, and polls do not wait
 # for it.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)

@@ -35,35 +35,8 @@ _SIMULATED = "simulated_rank_k"
 TOLERANCE_DB = 0.01
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
-    """A named value in two reports, None if a report does not have it."""
-
-    key: str
-    first: Any
-    second: Any
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InputEntry:
-    """An input file that differs between the reports.
-
-    ``what`` is "added", "removed" or "changed".
-    """
-
-    role: str
-    path: str
-    what: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReportSide:
-    """One of the two reports: its folder, when it was made, and by which version."""
-
-    folder: str
-    flight: str
-    generated: str
-    version: str
+# A row of the comparison, such as a setting with its two values.
+_Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,10 +45,12 @@ class ReportDiff:
 
     Parameters
     ----------
-    settings, versions : tuple of Entry
-        Values that differ.
-    inputs : tuple of InputEntry
-        Input files that differ.
+    first, second : mapping
+        ``folder``, ``flight``, ``generated`` (time) and ``version`` of each report.
+    settings, versions : tuple of mapping
+        ``key`` of each value that differs, with its values ``first`` and ``second``, None if a report does not have it.
+    inputs : tuple of mapping
+        ``role`` and ``path`` of each input file that differs, and ``what``: "added", "removed" or "changed".
     levels, ranks : tuple
         Differences on common samples.
     pooled : PairedDifference, optional
@@ -86,11 +61,11 @@ class ReportDiff:
         Limits of the comparison, and numbers that look wrong.
     """
 
-    first: ReportSide
-    second: ReportSide
-    settings: tuple[Entry, ...]
-    inputs: tuple[InputEntry, ...]
-    versions: tuple[Entry, ...]
+    first: _Row
+    second: _Row
+    settings: tuple[_Row, ...]
+    inputs: tuple[_Row, ...]
+    versions: tuple[_Row, ...]
     levels: tuple[LevelDifference, ...]
     ranks: tuple[RankDifference, ...]
     pooled: PairedDifference | None
@@ -134,9 +109,23 @@ def run_diff(first: Path, second: Path) -> ReportDiff:
     InputError
         If a folder is not a report, is of an older version, or is damaged.
     """
-    first_report, second_report = _read_report(first), _read_report(second)
-    _same_flight(first_report, second_report)
-    return _compare_reports(first_report, second_report)
+    mine, theirs = _read_report(first), _read_report(second)
+    _same_flight(mine, theirs)
+    compared = list(_levels(mine, theirs))
+    residuals, places = [item[1] for item in compared], [item[2] for item in compared]
+    return ReportDiff(
+        first=_side(mine),
+        second=_side(theirs),
+        settings=tuple(_entries(mine.metrics["settings"], theirs.metrics["settings"])),
+        inputs=tuple(_inputs(mine.metrics["inputs"], theirs.metrics["inputs"])),
+        versions=tuple(_entries(mine.metrics["versions"], theirs.metrics["versions"])),
+        levels=tuple(item[0] for item in compared),
+        ranks=tuple(_ranks(mine, theirs)),
+        pooled=pooled_difference(residuals, place_m=places) if residuals else None,
+        links_first_only=tuple(sorted(_links(mine) - _links(theirs))),
+        links_second_only=tuple(sorted(_links(theirs) - _links(mine))),
+        remarks=(*mine.remarks, *theirs.remarks, *_learned_here(mine, theirs)),
+    )
 
 
 # --- reading --------------------------------------------------------------------------------------------------------
@@ -234,26 +223,6 @@ def _same_flight(first: ReadReport, second: ReadReport) -> None:
 # --- comparing ------------------------------------------------------------------------------------------------------
 
 
-def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
-    """Return the differences between two reports."""
-    compared = list(_levels(first, second))
-    residuals, places = [item[1] for item in compared], [item[2] for item in compared]
-    alone = [sorted(_links(a) - _links(b)) for a, b in ((first, second), (second, first))]
-    return ReportDiff(
-        first=_side(first),
-        second=_side(second),
-        settings=tuple(_entries(first.metrics["settings"], second.metrics["settings"])),
-        inputs=tuple(_inputs(first.metrics["inputs"], second.metrics["inputs"])),
-        versions=tuple(_entries(first.metrics["versions"], second.metrics["versions"])),
-        levels=tuple(item[0] for item in compared),
-        ranks=tuple(_ranks(first, second)),
-        pooled=pooled_difference(residuals, place_m=places) if residuals else None,
-        links_first_only=tuple(alone[0]),
-        links_second_only=tuple(alone[1]),
-        remarks=(*first.remarks, *second.remarks, *_learned_here(first, second)),
-    )
-
-
 def _learned_here(first: ReadReport, second: ReadReport) -> Iterator[str]:
     """Yield a remark on the links of each report whose model was learned from this flight's log."""
     for side in (first, second):
@@ -261,14 +230,11 @@ def _learned_here(first: ReadReport, second: ReadReport) -> Iterator[str]:
             yield f"{side.place}: {', '.join(names)}: learned from this flight's own log, so errors are not compared."
 
 
-def _side(side: ReadReport) -> ReportSide:
+def _side(side: ReadReport) -> _Row:
     m = side.metrics
-    return ReportSide(
-        folder=str(side.place),
-        flight=str(m["flight"]),
-        generated=str(m.get("generated", "")),
-        version=f"aerpaw-cmp {m['versions'].get('aerpaw-cmp', 'unknown')}",
-    )
+    version = f"aerpaw-cmp {m['versions'].get('aerpaw-cmp', 'unknown')}"
+    made = str(m.get("generated", ""))
+    return {"folder": str(side.place), "flight": str(m["flight"]), "generated": made, "version": version}
 
 
 def _links(side: ReadReport) -> set[str]:
@@ -288,15 +254,15 @@ def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-def _entries(first: Any, second: Any) -> Iterator[Entry]:
+def _entries(first: Any, second: Any) -> Iterator[_Row]:
     """Yield the keys whose values differ."""
     first_values, second_values = dict(flat(first)), dict(flat(second))
     for key in [*first_values, *(key for key in second_values if key not in first_values)]:
         if (key in first_values) != (key in second_values) or first_values[key] != second_values[key]:
-            yield Entry(key=key, first=first_values.get(key), second=second_values.get(key))
+            yield {"key": key, "first": first_values.get(key), "second": second_values.get(key)}
 
 
-def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterator[InputEntry]:
+def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterator[_Row]:
     """Yield files that were added, removed or changed. A moved file with the same content is unchanged."""
     sides = [{(i.get("role", ""), i["path"]): i.get("sha256") for i in side} for side in (first, second)]
     contents = [{(role, digest) for (role, _), digest in side.items()} for side in sides]
@@ -304,7 +270,8 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
         before, after = (side.get((role, path)) for side in sides)
         if ((role, before or after) in contents[0] & contents[1] and None in (before, after)) or before == after:
             continue
-        yield InputEntry(role=role, path=path, what="changed" if before and after else "removed" if before else "added")
+        what = "changed" if before and after else "removed" if before else "added"
+        yield {"role": role, "path": path, "what": what}
 
 
 # --- samples --------------------------------------------------------------------------------------------------------

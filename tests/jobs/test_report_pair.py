@@ -41,8 +41,8 @@ def test_diff_of_two_runs_names_the_setting_and_the_levels(pair: tuple[Path, Pat
     from aerpaw_cmp.jobs.diff_reports import run_diff
 
     difference = run_diff(*pair)
-    assert [(e.key, e.first, e.second) for e in difference.settings] == [("rt.max_depth", 1, 0)]
-    assert [(e.role, e.what) for e in difference.inputs] == [("flight file", "changed")]
+    assert [(*e.values(),) for e in difference.settings] == [("rt.max_depth", 1, 0)]
+    assert [(e["role"], e["what"]) for e in difference.inputs] == [("flight file", "changed")]
     assert difference.versions == ()
     (level,) = difference.levels
     tables = [pd.read_csv(folder / "rss.csv") for folder in pair]

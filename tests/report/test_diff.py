@@ -82,8 +82,8 @@ def test_one_setting_is_named_by_its_key(pair):
     change_metrics(pair[1], lambda m: m["settings"]["rt"].update(max_depth=1, engine=None))
     change_metrics(pair[1], lambda m: m["versions"].update(numpy="1.0"))
     diff = run_diff(*pair)
-    assert [(e.key, e.first, e.second) for e in diff.settings] == [("rt.max_depth", 2, 1), ("rt.engine", None, None)]
-    assert [e.key for e in diff.versions] == ["numpy"]
+    assert [(*e.values(),) for e in diff.settings] == [("rt.max_depth", 2, 1), ("rt.engine", None, None)]
+    assert [e["key"] for e in diff.versions] == ["numpy"]
     assert diff.differences == (), "a setting alone is no number"
     assert "1 version" in verdict(diff)
 
@@ -106,7 +106,7 @@ def test_inputs_are_compared_by_content(pair):
 
     change_metrics(pair[1], change)
     diff = run_diff(*pair)
-    assert [(e.path, e.what) for e in diff.inputs] == [(diff.inputs[0].path, "changed"), ("new.txt", "added")]
+    assert [(e["path"], e["what"]) for e in diff.inputs] == [(diff.inputs[0]["path"], "changed"), ("new.txt", "added")]
 
 
 @pytest.fixture

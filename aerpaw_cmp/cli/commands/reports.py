@@ -116,11 +116,11 @@ def _print_diff(comparison: Any) -> None:
         say.warn(f"warning: {one_line(text)}")
     for title, items in (("setting", comparison.settings), ("version", comparison.versions)):
         for item in items[:_SHOWN]:
-            show(one_line(f"{title} {item.key}: {in_short(item.first)} -> {in_short(item.second)}"))
+            show(one_line(f"{title} {item['key']}: {in_short(item['first'])} -> {in_short(item['second'])}"))
         if len(items) > _SHOWN:
             show(f"and {len(items) - _SHOWN} more {title}s")
     for item in comparison.inputs:
-        show(one_line(f"input {item.path} ({item.role}): {item.what}"))
+        show(one_line(f"input {item['path']} ({item['role']}): {item['what']}"))
     _print_numbers(comparison)
 
 

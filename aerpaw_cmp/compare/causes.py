@@ -872,7 +872,9 @@ def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) ->
 def _controlled(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a gain control, which follows the mean level over some time, as an alternative without a name."""
     for slow in slow_levels(e.time_s, e.predicted_db):
-        yield Trial(cost=math.log(len(_CONTROLS_S)), columns=_SLOPE * (slow - slow.mean())[:, None])
+        # it reduces changes of the level; larger ones have another slope
+        if (e.measured_db - e.predicted_db) @ (slow - slow.mean()) < 0.0:
+            yield Trial(cost=math.log(len(_CONTROLS_S)), columns=_SLOPE * (slow - slow.mean())[:, None])
 
 
 def slow_levels(time_s: FloatArray, level_db: FloatArray) -> Iterator[FloatArray]:

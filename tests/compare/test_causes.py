@@ -789,6 +789,8 @@ def test_a_gain_control_makes_no_clock_late() -> None:
     assert falls[0] > 0.1
     assert falls[1] == 0.0
     assert _named(replace(sound, measured_db=early[1])) == NONE
+    assert len([*causes._controlled(replace(sound, measured_db=early[1]))]) == 3
+    assert not [*causes._controlled(replace(sound, measured_db=1.5 * sound.predicted_db))], "it does not amplify"
 
 
 def test_readings_that_are_repeated_are_one_reading() -> None:

@@ -415,13 +415,14 @@ def rank_with_positions(folder: Path, origin: str = ORIGIN) -> Path:
 
 def test_a_rank_log_without_a_clock_may_be_of_another_flight(tmp_path: Path) -> None:
     path = rank_with_positions(tmp_path)
-    assert not gathered(path).doubts, "nor has the track a clock"
+    # the mapped heights of a track at 40 m are another doubt
+    assert not [text for text in gathered(path).doubts if "clock" in text], "nor has the track a clock"
     content = yaml.safe_load(path.read_text())
     del content["logs"][0]["time_origin"]
     track = pd.read_csv(tmp_path / "track.csv")
     track["t"] += pd.Timestamp(ORIGIN).timestamp()
     track.to_csv(tmp_path / "track.csv", index=False)
-    (doubt,) = gathered(write_yaml(path, content)).doubts
+    (doubt,) = (text for text in gathered(write_yaml(path, content)).doubts if "clock" in text)
     assert doubt == "ri.csv has no clock: by its positions it may belong to another flight on this route"
 
 

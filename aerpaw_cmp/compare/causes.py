@@ -227,30 +227,38 @@ _DISTINCT = 1.7
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Conditions:
-    """The conditions that a cause must meet before it is named."""
+    """The conditions that a cause must meet before it is named.
+
+    Parameters
+    ----------
+    lead : float
+        Log odds per channel against all explanations without it.
+    share : float
+        Smallest reduction of the RMSE, as a share.
+    learned_share : float
+        The same with learned antennas, whose error is a few decibels on every flight.
+    part : float
+        Smallest reduction of the error that remains after the other causes, as a share of that by all candidates. It
+        applies to flights without learned antennas.
+    of_uav : bool
+        True if the cause changes the levels of all channels.
+    of_tower : bool
+        True if the cause changes the levels of all channels of a tower.
+    follows : float, optional
+        Largest remaining error as a share of that of a constant level, which fits a log of noise best.
+    most_left : float
+        Largest remaining error, as a multiple of the largest error of a held-out flight. With 1, a cause that restores
+        the usual error does not need the smallest reduction.
+    """
 
     lead: float = -math.inf
-    """Log odds per channel against all explanations without it."""
     share: float = 0.1
-    """Smallest reduction of the RMSE, as a share."""
     learned_share: float = 0.0
-    """The same with learned antennas, whose error is a few decibels on every flight."""
     part: float = 0.0
-    """Smallest reduction of the error that remains after the other causes, as a share of that by all candidates.
-
-    It applies to flights without learned antennas.
-    """
     of_uav: bool = False
-    """True if the cause changes the levels of all channels."""
     of_tower: bool = False
-    """True if the cause changes the levels of all channels of a tower."""
     follows: float | None = None
-    """Largest remaining error as a share of that of a constant level, which fits a log of noise best."""
     most_left: float = 2.0
-    """Largest remaining error, as a multiple of the largest error of a held-out flight.
-
-    With 1, a cause that restores the usual error does not need the smallest reduction.
-    """
 
 
 _CONDITIONS = {

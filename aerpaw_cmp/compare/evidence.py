@@ -63,6 +63,24 @@ class LevelEvidence:
         1 if in lock (or served by this cell), 0 if not, NaN if unknown. None if the log has no such column.
     clock : ClockResult, optional
         Test result of the radio clock.
+    floored : bool
+        True if the settings remove levels at the floor, so that only upward fading of the lowest links remains.
+    limits_known : bool
+        True if both levels were already raised to the receiver's floor, as in the numbers of the page.
+    learned : LearnedSeries, optional
+        Learned antenna of the tower with the errors of held-out flights, if the flight uses one.
+    transmit_power_dbm : float
+        Transmit power of the predicted level.
+    distance_db : (n,), optional
+        Part (n,) of the predicted level that depends only on the distance.
+    displaced_db : mapping of (float, float) to (n,)
+        Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg].
+    least : (n,) bool, optional
+        Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent.
+    others : tuple of LevelEvidence
+        The other channels of the tower, which step at the same time if a cable or a gain changes, or can be swapped.
+    step_db : float
+        Smallest difference between two levels of the log: its rounding.
     """
 
     time_s: FloatArray
@@ -87,23 +105,14 @@ class LevelEvidence:
     serving: FloatArray | None = None
     clock: ClockResult | None = None
     floored: bool = False
-    """True if the settings remove levels at the floor, so that only upward fading of the lowest links remains."""
     limits_known: bool = False
-    """True if both levels were already raised to the receiver's floor, as in the numbers of the page."""
     learned: LearnedSeries | None = None
-    """Learned antenna of the tower with the errors of held-out flights, if the flight uses one."""
     transmit_power_dbm: float = 0.0
-    """Transmit power of the predicted level."""
     distance_db: FloatArray | None = None
-    """Part (n,) of the predicted level that depends only on the distance."""
     displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
-    """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]."""
     least: BoolArray | None = None
-    """Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent."""
     others: tuple[LevelEvidence, ...] = ()
-    """The other channels of the tower, which step at the same time if a cable or a gain changes, or can be swapped."""
     step_db: float = 0.0
-    """Smallest difference between two levels of the log: its rounding."""
 
 
 def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:

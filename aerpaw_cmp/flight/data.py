@@ -123,6 +123,23 @@ class RssSeries:
     """The measured RSS of one tower and channel.
 
     ``time`` (n,) is in UTC. ``measured_db`` (n,) is NaN out of coverage.
+
+    Parameters
+    ----------
+    settings_key : str
+        A key that is equal for series with equal link settings. Such series share a replay.
+    log : (n,) int
+        Number of the log (n,) under ``logs:`` that contains each sample.
+    line : (n,) int
+        Line (n,) of each sample in that log.
+    noise_dbm : float, optional
+        Noise of the receiver for a signal-to-noise ratio, if its bandwidth or floor is known [dBm]. None for levels.
+    flagged : mapping of str to int
+        Numbers of rows of the log that are excluded because of a flag, by flag.
+    serving : (n,), optional
+        Serving state of a cell: 1 if it served the phone, 0 if another did, NaN unknown (n,). None for other levels.
+    locked : (n,), optional
+        Receiver lock of a sounder: 1 in lock, 0 without lock, NaN unknown (n,). None for other levels.
     """
 
     tower: str
@@ -132,19 +149,12 @@ class RssSeries:
     measured_db: FloatArray
     link: LinkSettings
     settings_key: str
-    """A key that is equal for series with equal link settings. Such series share a replay."""
     log: IntArray
-    """Number of the log (n,) under ``logs:`` that contains each sample."""
     line: IntArray
-    """Line (n,) of each sample in that log."""
     noise_dbm: float | None = None
-    """Noise of the receiver for a signal-to-noise ratio, if its bandwidth or floor is known [dBm]. None for levels."""
     flagged: Mapping[str, int] = field(default_factory=dict)
-    """Numbers of rows of the log that are excluded because of a flag, by flag."""
     serving: FloatArray | None = None
-    """Serving state of a cell: 1 if it served the phone, 0 if another did, NaN unknown (n,). None for other levels."""
     locked: FloatArray | None = None
-    """Receiver lock of a sounder: 1 in lock, 0 without lock, NaN unknown (n,). None for other levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,13 +178,27 @@ class RankSeries:
 
 @dataclass(frozen=True, slots=True)
 class FlightData:
-    """The data of a flight before the replay."""
+    """The data of a flight before the replay.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of logs and antenna files: ``--logs-root``, or the folder of the flight file.
+    site_place : str or Path
+        Site file in the folder of the flight file, or the name of a packaged site.
+    nodes : mapping of str to Track
+        Tracks of the towers that move. ``site`` has them at the middle of their positions.
+    doubts : tuple of str
+        Clauses about clocks and heights that the summary of a report repeats.
+    cautions : tuple of str
+        Sentences about settings of the user that do not fit the flight. They come before all other warnings.
+    kept_marks : list of str
+        Fingerprints of the series, from :func:`.marks_of`. Empty until they are needed.
+    """
 
     settings: FlightFile
     folder: Path
-    """Folder of logs and antenna files: ``--logs-root``, or the folder of the flight file."""
     site_place: str | Path
-    """Site file in the folder of the flight file, or the name of a packaged site."""
     site: Site
     files: tuple[IngestedFile, ...] = ()
     track: Track | None = None
@@ -182,13 +206,9 @@ class FlightData:
     rank: tuple[RankSeries, ...] = ()
     warnings: tuple[str, ...] = ()
     nodes: Mapping[str, Track] = field(default_factory=dict)
-    """Tracks of the towers that move. ``site`` has them at the middle of their positions."""
     doubts: tuple[str, ...] = ()
-    """Clauses about clocks and heights that the summary of a report repeats."""
     cautions: tuple[str, ...] = ()
-    """Sentences about settings of the user that do not fit the flight. They come before all other warnings."""
     kept_marks: list[str] = field(init=False, default_factory=list, repr=False, compare=False)
-    """Fingerprints of the series, from :func:`.marks_of`. Empty until they are needed."""
     _links: dict[str, Link] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @property

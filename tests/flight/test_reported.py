@@ -175,7 +175,7 @@ def test_a_folder_names_a_tower_of_the_users_site(tmp_path: Path, folder: str, n
     place = "{latitude_deg: 35.7275, longitude_deg: -78.6970, antenna_height_m: 10}"
     site.write_text(site.read_text().split("towers:")[0] + f"towers:\n  North_Mast: {place}\n  T2: {place}\n")
     (log,) = (f for f in ingest([tmp_path / "c/own"], options=ReadOptions(timezone="UTC")) if "power" in f.path)
-    assert _entry(log, log.path, ("North_Mast", "T2"))[0]["node"] == node
+    assert _entry(log, log.path, ("North_Mast", "T2"), tmp_path)[0]["node"] == node
     assert load_site(site).towers.keys() == {"North_Mast", "T2"}
 
 

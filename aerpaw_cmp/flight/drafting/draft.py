@@ -205,6 +205,7 @@ def draft(
         positioned=any(_has_positions(stream) for stream in every),
         locks=any(may_lose_lock(stream) for stream in every),
         towers=tuple(site.towers),
+        shared=Path(os.path.commonpath([Path(file.path).resolve().parent for file in files])),
         finder=_node_finder(files, flown, site),
     )
     lines = _lines(files, context)
@@ -580,6 +581,8 @@ class _Context:
         True if the receiver is a sounder that can lose its lock.
     towers : sequence of str
         Towers of the site.
+    shared : Path
+        Innermost folder that contains all logs.
     finder : NodeFinder, optional
         Proposals for nodes, or None if there is no track at the site.
     """
@@ -593,6 +596,7 @@ class _Context:
     positioned: bool
     locks: bool
     towers: Sequence[str]
+    shared: Path
     finder: NodeFinder | None
 
     @property
@@ -779,7 +783,7 @@ def _with_node(
     earlier: Sequence[_Line],
 ) -> tuple[dict[str, Any], str, tuple[Placement, ...]]:
     """Return the keys of a log with its nodes, the question about them, and the nodes that its levels fit."""
-    entry, comment = _entry(file, path, context.towers)
+    entry, comment = _entry(file, path, context.towers, context.shared)
     finder = context.finder
     if finder is None:
         return entry, comment, ()
@@ -1096,15 +1100,15 @@ def _cells(streams: Sequence[Stream]) -> list[int | str]:
     return sorted((cell for cell in most_sampled if 20 * counts[cell] >= most), key="{:>9}".format)
 
 
-def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[str, Any], str]:
+def _entry(file: IngestedFile, path: str, towers: Sequence[str], shared: Path) -> tuple[dict[str, Any], str]:
     """Return the keys of a log and a question about its node, if that is a guess."""
     entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
     need = [s for s in file.result.streams if s.kind in ("rss", "rank") and not s.attributes.get("node")]
     if not need:
         return entry, ""
     here = Path(file.path).resolve()
-    # only the file, its folder and folders below the draft, because a home folder may have the name of a tower
-    below = path if not path.startswith(("/", "..")) else ""
+    # a home folder may have the name of a tower: only the file, its folder, and folders below the draft or among logs
+    below = str(here.relative_to(shared)) if path.startswith(("/", "..")) else path
     near = named_tower("/".join(here.parts[-2:]), towers) or named_tower(below, towers)
     alone = towers[0] if len(towers) == 1 else None
     entry["node"] = near or named_tower(path, towers) or alone or next(iter(towers), "LW1")

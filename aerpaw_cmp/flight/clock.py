@@ -282,7 +282,7 @@ def _held_s(channels: Sequence[ClockChannel]) -> float:
     for channel in channels:
         known = np.isfinite(channel.measured_db)
         level_db = channel.measured_db[known]
-        inside = (level_db > level_db.min()) & (level_db < level_db.max())
+        inside = (level_db > level_db.min(initial=np.inf)) & (level_db < level_db.max(initial=-np.inf))
         old_s.append(ages(channel.time_s[known], level_db)[inside])
     return float(np.quantile(np.concatenate(old_s), 0.9))
 

@@ -439,6 +439,14 @@ def test_samples_whose_lags_the_telemetry_does_not_reach_take_no_part(first: flo
     assert len(bins.at_s) == count
 
 
+def test_a_channel_without_levels_does_not_prevent_the_test_of_the_others() -> None:
+    heard = channel(1.0, seed=1)
+    silent = dataclasses.replace(channel(seed=2, name="two"), measured_db=np.full(len(heard.time_s), np.nan))
+    both, alone = judge_clock([heard, silent]), judge_clock([heard])
+    assert (both.verdict, both.radio_minus_telemetry_s) == (alone.verdict, alone.radio_minus_telemetry_s)
+    assert judge_clock([silent]).verdict == CANNOT_TELL
+
+
 @pytest.mark.parametrize(("bend", "finest"), [(30.0, 0.02), (0.01, 0.5)])
 def test_lags_are_tried_finely_where_one_stands_out(bend: float, finest: float) -> None:
     lags = np.arange(-30, 31) * 0.5

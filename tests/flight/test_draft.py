@@ -278,6 +278,8 @@ def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) 
 def test_nothing_to_compare_is_said_with_options_to_paste(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UsageError, match="no log of RSS or rank"):
         draft(ingest(logs.glob("UAV/*vehicleOut.txt"), options=OPTIONS), logs)
+    with pytest.raises(UsageError, match="no log of RSS or rank"):
+        draft([], logs)
     tracks = [logs / "today.csv", logs / "tomorrow.csv"]
     for day, track in enumerate(tracks, 1):
         rows = (f"2025-06-0{day}T10:00:{s:02d}Z,35.73,{-78.7 + s * 1e-4},30\n" for s in range(60))

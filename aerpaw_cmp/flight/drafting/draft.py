@@ -205,7 +205,7 @@ def draft(
         positioned=any(_has_positions(stream) for stream in every),
         locks=any(may_lose_lock(stream) for stream in every),
         towers=tuple(site.towers),
-        shared=Path(os.path.commonpath([Path(file.path).resolve().parent for file in files])),
+        shared=Path(os.path.commonpath([Path(file.path).resolve().parent for file in files] or [folder])),
         finder=_node_finder(files, flown, site),
     )
     lines = _lines(files, context)

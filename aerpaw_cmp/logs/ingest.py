@@ -551,10 +551,10 @@ def _later(result: ReadResult, rollovers: int) -> ReadResult:
 
 
 def _inside(
-    place: Path, options: _OptionsFor | None, chosen: Reader | None, before: Sequence[IngestedFile]
+    place: Path, options: _OptionsFor | None, chosen: Reader | None, before: Sequence[IngestedFile] | None
 ) -> _Found:  # fmt: skip
-    """Read a file of a folder: a log, an archive, or those logs of a flight file that were not read before."""
-    if not _is_flight_file(place):
+    """Read a file of a folder: a log, an archive, or, if ``before`` is given, the other logs of a flight file."""
+    if before is None:
         if _is_archive(place):
             return _archive(place, options, chosen)
         return [read_file(place, options=options, reader=chosen)], []
@@ -572,13 +572,15 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
         places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
-    for place in sorted(places, key=_is_flight_file):  # flight files last, because they may contain logs of the folder
+    is_flight_file = {place: _is_flight_file(place) for place in places}
+    # flight files last, because they may contain logs of the folder
+    for place in sorted(places, key=is_flight_file.__getitem__):
         if not place.is_file():  # links to folders are not followed, because they may form a circle
             what = "a link to a folder: name that folder as well" if place.is_dir() else "a broken link"
             skipped.append(Skipped(str(place), what))
             continue
         try:
-            inside, below = _inside(place, options, chosen, files)
+            inside, below = _inside(place, options, chosen, files if is_flight_file[place] else None)
         except AerpawCmpError as error:
             meta = place.with_suffix(".sigmf-meta")
             inside, below = [], [Skipped.of(place, {meta.name} if meta.exists() else (), error)]

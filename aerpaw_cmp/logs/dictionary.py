@@ -231,13 +231,10 @@ _OF_WHO = re.compile(r"\b(id|identity|name|no|num|number|index|address|addr)\b")
 def _split(name: str, what: Meaning | None) -> tuple[str, str]:
     """Return the words that name a cell other than its PCI, and the words that an identity and a level share."""
     bare = re.sub(r"(?<=[a-z])(?=\d)", " ", without_unit(name)[0])
-    kind = (
-        ""
-        if what and what.quantity.role != "identity"
-        else " ".join(part[0] for part in PATTERNS["who"].finditer(bare))
-    )
+    who, is_quantity = PATTERNS["who"], what is not None and what.quantity.role != "identity"
+    kind = "" if is_quantity else " ".join(part[0] for part in who.finditer(bare))
     form = next((form for form, row in _forms() if what and row.name == what.quantity.name), _OF_WHO)
-    rest = _OF_WHO.sub(" ", PATTERNS["who"].sub(" ", form.sub(" ", bare)))
+    rest = _OF_WHO.sub(" ", who.sub(" ", form.sub(" ", bare)))
     return kind, " ".join(_UNPAIRED.sub(" ", rest).split())
 
 
@@ -420,15 +417,9 @@ def unit_of(written: str) -> str:
     """Return the unit to which a written unit is converted, an unknown unit as written, else an empty text."""
     written = _scale(written)[1]
     known = UNITS.get(written)
-    return (
-        known[0]
-        if known
-        else "deg"
-        if written in _DDMM
-        else written
-        if written in _FACTORS or _A_UNIT.fullmatch(written)
-        else ""
-    )
+    if known or written in _DDMM:
+        return known[0] if known else "deg"
+    return written if written in _FACTORS or _A_UNIT.fullmatch(written) else ""
 
 
 def converted(values: FloatArray, written: str) -> FloatArray:

@@ -162,7 +162,8 @@ class Sheet:
         0-based lines of titles, headers and text below the table.
     rejected : list of RejectedLine
     notes : dict
-        Sentences about columns that are not read as they are written, by column.
+        Sentences about columns that are not read as they are written, by column. The number of columns is the key of a
+        sentence about the table.
     closed : bool
         True if rows have their own end mark, so that a missing line end does not matter.
     said : dict
@@ -402,7 +403,9 @@ class Sheet:
         left = [i for i in range(len(self.names)) if i not in self.used and self._is_of_interest(i)]
         shown = ", ".join(repr(self.names[i]) for i in left[:_MOST_NAMED])
         more = f" and {len(left) - _MOST_NAMED} more" if left[_MOST_NAMED:] else ""
-        said = [text for i, text in sorted(self.notes.items()) if i in self.used or "dBuV" not in text]
+        # nobody needs the conversion of a column that is not read
+        idle = {i for i, _ in enumerate(self.names) if i not in self.used and self.unit(i) in dictionary.ACROSS_50_OHM}
+        said = [text for i, text in sorted(self.notes.items()) if i not in idle]
         if left:
             said.append(f"not read, though they look like levels, identities, positions or times: {shown}{more}")
         gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]

@@ -303,9 +303,8 @@ def zone_of_cell(text: str) -> str:
     """
     number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
     if number is None or re.fullmatch(r"[+-]\d{4}", text):
-        word = (
-            text.upper() if text.upper() in {*_HOURS, *dictionary.WINTER, *_WITH_SUMMER} else text
-        )  # 'home' is not a zone
+        # 'home' is not a zone
+        word = text.upper() if text.upper() in {*_HOURS, *dictionary.WINTER, *_WITH_SUMMER} else text
         return word if re.fullmatch(_NAMED_ZONE, word) and ("/" not in word or _at(word, datetime.min)) else ""
     hours = float(text)
     # zones are at most 14 h from UTC: larger numbers are minutes (840) or seconds

@@ -405,14 +405,17 @@ def _models(e: LevelEvidence) -> _Models:
         return _Model(e, trials, fit.residual_db, gain, fit.parameters)
 
     def best_of(sets: Iterable[tuple[Trial, ...]], at: NoiseParameters) -> list[_Model]:
-        """Return the likeliest model of each set of names, best first, with its own noise."""
+        """Return the likeliest model of each set of names, best first, with its own noise.
+
+        Unnamed levels and unnamed gains are separate, because their order can change with other noise.
+        """
         best: dict[tuple[frozenset[str], bool], _Model] = {}
         for trials in sets:
             tried = model(*trials, at=at, search=False)
-            # with other noise, levels of another time may be likelier than unknown gains
-            names = _names(tried), not trials[-1].name and trials[-1].columns is not None
-            if len(names[0]) == len(trials) and (names not in best or tried.gain > best[names].gain):
-                best[names] = tried
+            names, last = _names(tried), trials[-1]
+            kind = names, not last.name and last.columns is not None
+            if len(names) == len(trials) and (kind not in best or tried.gain > best[kind].gain):
+                best[kind] = tried
         likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
         return sorted((model(*m.trials, at=at) for m in likely), key=lambda m: -m.gain)
 

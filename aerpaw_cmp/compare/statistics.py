@@ -379,11 +379,11 @@ class Channels:
         square = np.maximum(likelihoods(np.vstack([slow, slow.sum(axis=0)]), joined.parts)[1], 1e-300)
         each, whole = square[:-1].sum(axis=0), square[-1]
         log = joined.joined("log_det") - 0.5 * terms * np.log(each)
-        every, fast = np.ones(len(RATES)), np.where(RATES > _VISIBLE, 1.0, 0.0)
-        over_time = [fast if share else every for share in WHITE_SHARES]
+        equal, fast = np.ones(len(RATES)), np.where(RATES > _VISIBLE, 1.0, 0.0)
+        over_time = [fast if share else equal for share in WHITE_SHARES]
         over_place = known.weights[len(known.parts[0].power) :]  # as in ``placed``, but not used there
         over_place = over_place / over_place.max(initial=1e-300)
-        prior = np.concatenate([*over_time, every, 0.0 * over_place, fast, every, over_place])
+        prior = np.concatenate([*over_time, equal, 0.0 * over_place, fast, equal, over_place])
         shown = prior * np.exp(further * (log - log.max()))
         shown /= max(float(shown.sum()), 1e-300)
         odds = further * np.exp(-0.5 * (shown @ np.log(whole / each) / _SUM_OF_POWERS) ** 2)

@@ -257,8 +257,7 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
     """Return the logs of a series from which its antennas or the settings of its flight file were learned."""
     logs, settings = logs_of(data, series), data.settings
     patterns = learned_patterns(link, data.folder, data.site_place)
-    learned = union(settings.marks, *(p.marks for p in patterns))
-    if any(among(mark, learned) for mark in marks_of([data])):
+    if is_training_data(data, (), union(settings.marks, *(p.marks for p in patterns))):
         return logs
     return common(logs, [settings.trained_on, *(p.trained_on for p in patterns)])
 

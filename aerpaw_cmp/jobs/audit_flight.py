@@ -168,7 +168,8 @@ _MOMENTS = 6
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected, RtSettings]]:
     """Yield replays with fixed towers, and their expected inputs and settings. A moving tower is fixed at times."""
-    for replayed, expected, rt in zip(replays, expectations(data, replays), _settings_of(data), strict=False):
+    of_each = _settings_of(data)[: len(replays)]
+    for replayed, expected, rt in zip(replays, expectations(data, replays), of_each, strict=True):
         site = data.site.under(rt.foliage)
         if replayed.tower_m is None:
             yield site, replayed, expected, rt

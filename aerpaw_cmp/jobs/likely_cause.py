@@ -116,18 +116,20 @@ def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
     It is 0 unless the RMSE also falls if a share of the slow level is fitted: a gain control reduces slow changes of
     the level, so that the rest seems to be early.
     """
-    squares = list[AnyArray]()
+    squares = list[list[AnyArray]]()  # of each channel, without a slow level and with each
     for e in channels:
         lag = 0.0 if e.clock is None else e.clock.radio_minus_telemetry_s
         known = np.isfinite(e.measured_db) & np.isfinite(e.predicted_db)
         time_s, level_db = e.time_s[known], e.predicted_db[known]
+        if not len(time_s):
+            continue
         errors_db = e.measured_db[known] - np.stack([level_db, np.interp(time_s - lag, time_s, level_db)])
-        fitted = (np.zeros(len(time_s)), *slow_levels(time_s, level_db)) if len(time_s) else ()
+        fitted = (np.zeros(len(time_s)), *slow_levels(time_s, level_db))
         designs = (np.column_stack([np.ones(len(time_s)), slow]) for slow in fitted)
-        squares += [np.square(errors_db.T - x @ np.linalg.lstsq(x, errors_db.T, rcond=None)[0]) for x in designs]
+        squares.append([np.square(errors_db.T - x @ np.linalg.lstsq(x, errors_db.T, rcond=None)[0]) for x in designs])
     if not squares:
         return 0.0
-    of_models = (np.sqrt(np.concatenate(squares[i::4]).mean(axis=0)) for i in range(4))
+    of_models = (np.sqrt(np.concatenate(model).mean(axis=0)) for model in zip(*squares, strict=True))
     fall_db, *others_db = (float(before - after) for before, after in of_models)
     return fall_db if min(others_db) > 0.0 else 0.0
 

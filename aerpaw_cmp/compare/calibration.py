@@ -124,11 +124,16 @@ class Mounted:
 
 @dataclass(frozen=True, slots=True)
 class Learned(Mounted):
-    """The result of :func:`learn`."""
+    """The result of :func:`learn`.
+
+    Parameters
+    ----------
+    fading : mapping of str to (float, float)
+        Fading of the training flights by antenna, from :func:`~aerpaw_cmp.compare.gains.fading_of`.
+    """
 
     fit: GainFit
     fading: Mapping[str, tuple[float, float]]
-    """Fading of the training flights by antenna, from :func:`~aerpaw_cmp.compare.gains.fading_of`."""
 
     @property
     def model(self) -> GainModel:
@@ -609,6 +614,8 @@ class Correction:
     sd_factor : float
         Factor applied to all standard deviations, so that they agree with the held-out errors. Each candidate of
         ``held_out`` has its own factor.
+    fits : mapping of str to FieldFit
+        The solved fields by antenna.
     """
 
     base: str
@@ -624,7 +631,6 @@ class Correction:
     held_out_parts: tuple[tuple[str, int], ...] = ()
     sd_factor: float = 1.0
     fits: dict[str, FieldFit] = field(default_factory=dict, repr=False, compare=False)
-    """The solved fields by antenna."""
 
     @property
     def on(self) -> bool:

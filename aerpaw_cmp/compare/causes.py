@@ -54,6 +54,11 @@ class Trial:
     prior. ``clipped`` (n,) are samples whose level is not that of the link. ``fading`` (n,) is the share of the link's
     fading that the log shows. ``cost`` is the log likelihood lost by averaging over all possible numbers. A trial
     without a name is an alternative that is not named as a cause.
+
+    Parameters
+    ----------
+    channels : int
+        Number of channels of the tower that have the same numbers and share the cost of their search.
     """
 
     name: str = _UNNAMED
@@ -66,7 +71,6 @@ class Trial:
     fading: FloatArray | None = None
     estimate: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     channels: int = 1
-    """Number of channels of the tower that have the same numbers and share the cost of their search."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -210,6 +210,9 @@ class GainModel:
         Standard deviation of the noise of a bin [dB].
     bin_s : float
         Duration over which samples are averaged [s].
+    campaigns : tuple of (str, float, float)
+        Name, ``own_sd_db`` and ``noise_sd_db`` of each campaign that has its own values. A fit uses those of campaigns.
+        Antennas with enough levels follow, for the error of a level: the shadowing differs between ports of a tower.
     """
 
     terms: tuple[Term, ...] = ANTENNA_TERMS
@@ -218,10 +221,6 @@ class GainModel:
     noise_sd_db: float = 1.5
     bin_s: float = 4.0
     campaigns: tuple[tuple[str, float, float], ...] = ()
-    """Name, ``own_sd_db`` and ``noise_sd_db`` of each campaign that has its own values. A fit uses those of campaigns.
-
-    Antennas with enough levels follow, for the error of a level: the shadowing differs between ports of a tower.
-    """
 
     def scales_db(self, *names: str) -> tuple[float, float]:
         """Return the standard deviations of nuisance and noise of the first name that has its own values [dB]."""

@@ -592,6 +592,8 @@ class DetectionScore:
         selected by their level.
     reliability : tuple of (float, float, int)
         Mean probability, share detected, and number of samples, per fifth of the range of probability.
+    locks : bool
+        True if the log contains the lock. Otherwise samples without a level count as not detected.
     """
 
     floor_db: float
@@ -609,7 +611,6 @@ class DetectionScore:
     learned_on: str
     rmse_ci95_db: Interval = NO_INTERVAL
     locks: bool = False
-    """True if the log contains the lock. Otherwise samples without a level count as not detected."""
 
 
 def score_detection(

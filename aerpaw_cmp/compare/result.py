@@ -145,6 +145,25 @@ class RssFurther:
     ``n_outliers`` counts samples far outside the distribution of the levels of the channel; only
     ``rmse_without_outliers_db`` excludes them. The other counts are those of
     :class:`~aerpaw_cmp.compare.level.RssComparison`.
+
+    Parameters
+    ----------
+    detection : DetectionScore, optional
+        Scores of the detection, for a receiver that loses its lock or has a floor.
+    snr : SnrScore, optional
+        Error of the SNR, for a receiver whose bandwidth is known.
+    rmse_bound : str, optional
+        Reason why the interval of the RMSE is only a lower bound. None if it is an ordinary interval.
+    interval_notes : tuple of str, optional
+        Sentences about limits of the intervals: correlation over position is ignored, or the error is not stationary.
+    simulated_sd_db : float, optional
+        Mean stated SD of a sample with learned antennas [dB], from gain, nuisance of the flight, noise and fading.
+    error_bars : mapping of str to float, optional
+        Parts of that standard deviation [dB], and the shares of samples inside the stated 50, 90 and 95 % intervals.
+    elsewhere : mapping, optional
+        Errors of learned antennas on held-out flights of a ``kind`` [dB]: RMSE, of free space too, and of 4-s means.
+    trained_on : tuple of str, optional
+        SHA-256 of this series' logs from which its antennas or settings were learned. Then the series has no error.
     """
 
     n_measured_out: int
@@ -159,21 +178,13 @@ class RssFurther:
     compared_with: Mapping[str, PairedDifference]
     averaged: Mapping[str, Mapping[str, OffsetFit]]
     detection: DetectionScore | None = None
-    """Scores of the detection, for a receiver that loses its lock or has a floor."""
     snr: SnrScore | None = None
-    """Error of the SNR, for a receiver whose bandwidth is known."""
     rmse_bound: str | None = None
-    """Reason why the interval of the RMSE is only a lower bound. None if it is an ordinary interval."""
     interval_notes: tuple[str, ...] | None = None
-    """Sentences about limits of the intervals: correlation over position is ignored, or the error is not stationary."""
     simulated_sd_db: float | None = None
-    """Mean stated SD of a sample with learned antennas [dB], from gain, nuisance of the flight, noise and fading."""
     error_bars: Mapping[str, float] | None = None
-    """Parts of that standard deviation [dB], and the shares of samples inside the stated 50, 90 and 95 % intervals."""
     elsewhere: Mapping[str, Any] | None = None
-    """Errors of learned antennas on held-out flights of a ``kind`` [dB]: RMSE, of free space too, and of 4-s means."""
     trained_on: tuple[str, ...] | None = None
-    """SHA-256 of this series' logs from which its antennas or settings were learned. Then the series has no error."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,6 +213,10 @@ class RssResult:
     spans : tuple of ErrorSpan
         Segments with the largest errors.
     further : RssFurther
+    stated : StatedSpread, optional
+        Stated standard deviations of the simulated level with learned antennas.
+    tower_m : (n, 3), optional
+        Position of a tower that moves [m], NaN if unknown. None for a fixed tower.
     """
 
     tower: str
@@ -219,9 +234,7 @@ class RssResult:
     spans: tuple[ErrorSpan, ...]
     further: RssFurther
     stated: StatedSpread | None = None
-    """Stated standard deviations of the simulated level with learned antennas."""
     tower_m: FloatArray | None = None
-    """Position of a tower that moves, shape (n, 3) [m], NaN if unknown. None for a fixed tower."""
 
     @property
     def name(self) -> str:
@@ -280,6 +293,13 @@ class RankFurther:
     ``n_flagged`` counts samples by reason. The keys of ``foliage`` are run and K. ``commonest`` is the score of the
     constant forecast. ``repeat`` is the agreement of the modem with itself at positions that both halves of the flight
     visit.
+
+    Parameters
+    ----------
+    trained_on : tuple of str, optional
+        SHA-256 of the logs of this series to which the receiver was fitted. Such a series has no score.
+    agreement_sd_by_ground : mapping of str to float, optional
+        Standard deviation of the agreement, by K, if the ground is varied within the errors of the known heights.
     """
 
     n_flagged: Mapping[str, int]
@@ -288,9 +308,7 @@ class RankFurther:
     repeat: Mapping[str, RankRepeat]
     receiver: ForecastScore | None = None
     trained_on: tuple[str, ...] | None = None
-    """SHA-256 of the logs of this series to which the receiver was fitted. Such a series has no score."""
     agreement_sd_by_ground: Mapping[str, float] | None = None
-    """Standard deviation of the agreement, by K, if the ground is varied within the errors of the known heights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -317,6 +335,8 @@ class RankResult:
         Simulated rank per K; 0 without a path.
     score : RankComparison
     further : RankFurther
+    tower_m : (n, 3), optional
+        Position of a tower that moves [m]. None for a fixed tower.
     """
 
     tower: str
@@ -332,7 +352,6 @@ class RankResult:
     further: RankFurther
     probability: FloatArray | None = None
     tower_m: FloatArray | None = None
-    """Position of a tower that moves, shape (n, 3) [m]. None for a fixed tower."""
 
     @property
     def singular_ratio_db(self) -> FloatArray:
@@ -343,7 +362,15 @@ class RankResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditResult:
-    """The check of the engine against another engine, on links spread over all series."""
+    """The check of the engine against another engine, on links spread over all series.
+
+    Parameters
+    ----------
+    fields : FieldAudit, optional
+        Check of fields, paths and attitude against Sionna RT's coefficients and a second implementation.
+    read_from_cache_of : str
+        Date on which the audit was computed on this machine, if it comes from the cache. Otherwise empty.
+    """
 
     reference: str
     links: int
@@ -355,9 +382,7 @@ class AuditResult:
     reference_seconds: float = float("nan")
     note: str = ""
     fields: FieldAudit | None = None
-    """Check of fields, paths and attitude against Sionna RT's coefficients and a second implementation."""
     read_from_cache_of: str = ""
-    """Date on which the audit was computed on this machine, if it comes from the cache. Otherwise empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -399,6 +424,15 @@ class FlightResult:
 
     ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both are empty
     if no models were compared.
+
+    Parameters
+    ----------
+    verdict : FlightVerdict, optional
+        The comparison with the best baseline over all channels. None if nothing could be scored.
+    likely_cause : Cause, optional
+        The systematic error that explains most of the RMSE. None if none is identified.
+    next_step : str, optional
+        The next step of the user, as a clause. None if no known step would change the result.
     """
 
     rss: tuple[RssResult, ...] = ()
@@ -409,11 +443,8 @@ class FlightResult:
     models: tuple[ModelRow, ...] = ()
     ladder: tuple[ModelRow, ...] = ()
     verdict: FlightVerdict | None = None
-    """The comparison with the best baseline over all channels. None if nothing could be scored."""
     likely_cause: Cause | None = None
-    """The systematic error that explains most of the RMSE. None if none is identified."""
     next_step: str | None = None
-    """The next step of the user, as a clause. None if no known step would change the result."""
 
     @property
     def cause(self) -> str | None:

@@ -572,12 +572,13 @@ class ClockTrap:
         Hours to add to radio times.
     explanation : str
         Cause of the shift.
+    is_utc : bool
+        True if UTC that was read as local time explains the shift.
     """
 
     hours: float
     explanation: str
     is_utc: bool = False
-    """True if UTC that was read as local time explains the shift."""
 
     def advice(self) -> str:
         """Return cause and remedy as text."""

@@ -34,13 +34,18 @@ Span = tuple[np.datetime64, np.datetime64]
 
 @dataclass
 class Flight:
-    """The files of one flight, and its time span (None without absolute times)."""
+    """The files of one flight, and its time span (None without absolute times).
+
+    Parameters
+    ----------
+    unsure : mapping of str to str
+        Questions about files that may belong to another flight, by path.
+    """
 
     files: list[IngestedFile] = field(default_factory=list)
     span: Span | None = None
     place: tuple[float, float] | None = None
     unsure: dict[str, str] = field(default_factory=dict)
-    """Questions about files that may belong to another flight, by path."""
 
     @property
     def measured(self) -> list[Stream]:

@@ -159,7 +159,13 @@ class RssSeries:
 
 @dataclass(frozen=True, slots=True)
 class RankSeries:
-    """The reported rank at a tower: ``rank`` (n,), NaN without CSI, and ``position_m`` (n, 3) of the log or None."""
+    """The reported rank at a tower: ``rank`` (n,), NaN without CSI, and ``position_m`` (n, 3) of the log or None.
+
+    Parameters
+    ----------
+    flagged : mapping of str to int
+        Numbers of rows of the log that are excluded because of a flag, by flag.
+    """
 
     tower: str
     time: Times
@@ -168,7 +174,6 @@ class RankSeries:
     position_m: FloatArray | None
     log: IntArray
     flagged: Mapping[str, int] = field(default_factory=dict)
-    """Numbers of rows of the log that are excluded because of a flag, by flag."""
 
     @property
     def channel(self) -> str:

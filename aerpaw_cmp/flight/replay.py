@@ -47,7 +47,15 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """A replayed series. ``valid`` (n,) marks samples with a known pose; all other arrays contain only these."""
+    """A replayed series. ``valid`` (n,) marks samples with a known pose; all other arrays contain only these.
+
+    Parameters
+    ----------
+    tower_m : (poses, 3), optional
+        Position of a tower that moves [m]. None for a fixed tower.
+    learned : LearnedGain, optional
+        Contribution of learned antennas to the RSS, and its standard deviation.
+    """
 
     link: Link
     poses: Poses
@@ -56,9 +64,7 @@ class Replayed:
     track: TrackPoses | None = None
     clock: Clock | None = None
     tower_m: FloatArray | None = None
-    """Position of a tower that moves, shape (poses, 3) [m]. None for a fixed tower."""
     learned: LearnedGain | None = None
-    """Contribution of learned antennas to the RSS, and its standard deviation."""
 
     def level_dbm(self, kind: Literal["coherent", "power"]) -> FloatArray:
         """Return the level of the paths with the contribution of learned antennas, shape (poses,) [dBm]."""

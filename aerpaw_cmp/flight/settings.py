@@ -50,16 +50,23 @@ CarrierHz = Annotated[float, AfterValidator(_in_hertz)]
 
 
 class AntennaSettings(StrictModel):
-    """An element pattern: a named model, or a measured file."""
+    """An element pattern: a named model, or a measured file.
+
+    Parameters
+    ----------
+    variable : str, optional
+        Name of the grid inside a .mat file.
+    elevation : str, optional
+        CSV of the elevation cut, if ``file`` contains the azimuth cut.
+    learned : LearnedAntenna, optional
+        SHA-256 and error model of the file, if the model is a learned ``sphere``.
+    """
 
     model: Literal["iso", "dipole", "tr38901", "file", "gain_grid", "sphere"] = "iso"
     file: str | None = None
     variable: str | None = None
-    """Name of the grid inside a .mat file."""
     elevation: str | None = None
-    """CSV of the elevation cut, if ``file`` contains the azimuth cut."""
     learned: LearnedAntenna | None = None
-    """SHA-256 and error model of the file, if the model is a learned ``sphere``."""
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -79,11 +86,15 @@ class ArraySettings(StrictModel):
     (``positions_m``). ``tower_comparison`` (60 mm / 1.68 m / 60 mm) and ``uav_comparison`` (2 x 2 at half a wavelength)
     are the arrays of arXiv 2502.10324. ``yaw_deg`` is counter-clockwise from east (tower) or from the aircraft's nose
     (UAV with logged attitude). Positive ``pitch_deg`` turns the boresight down.
+
+    Parameters
+    ----------
+    elements : int, optional
+        Number of elements of layout ``linear``. The default is 4.
     """
 
     layout: Literal["single", "linear", "tower_comparison", "uav_comparison", "custom"] = "single"
     elements: Annotated[int, Field(ge=1, le=64)] | None = None
-    """Number of elements of layout ``linear``. The default is 4."""
     positions_m: Annotated[list[tuple[float, float, float]], Field(max_length=64)] | None = None
     antenna: AntennaSettings = AntennaSettings()
     slant_deg: float | list[float] = 0.0
@@ -170,13 +181,18 @@ def _sphere(settings: AntennaSettings, file: Path, folder: Path) -> Pattern:
 
 
 class LinkSettings(StrictModel):
-    """A radio link: carrier, power, and the arrays at both ends."""
+    """A radio link: carrier, power, and the arrays at both ends.
+
+    Parameters
+    ----------
+    bandwidth_hz : float, optional
+        Bandwidth of the receiver. A link is out of coverage below the noise in this bandwidth.
+    """
 
     carrier_hz: CarrierHz
     transmit_power_dbm: float = 40.0
     uav_transmits: bool = True
     bandwidth_hz: Positive | None = None
-    """Bandwidth of the receiver. A link is out of coverage below the noise in this bandwidth."""
     noise_figure_db: float | None = None
     tower: ArraySettings = ArraySettings()
     towers: dict[str, ArraySettings] = {}
@@ -208,11 +224,16 @@ class LinkSettings(StrictModel):
 
 
 class LinksSettings(StrictModel):
-    """The RSS and rank links. The defaults are those of the paper: single elements at 3.3 GHz, and 4 x 4 at 3.4 GHz."""
+    """The RSS and rank links. The defaults are those of the paper: single elements at 3.3 GHz, and 4 x 4 at 3.4 GHz.
+
+    Parameters
+    ----------
+    channels : mapping of str to LinkSettings
+        RSS links of channels that differ from ``rss``, by channel name (for example two antennas).
+    """
 
     rss: LinkSettings = LinkSettings(carrier_hz=3.3e9)
     channels: dict[str, LinkSettings] = {}
-    """RSS links of channels that differ from ``rss``, by channel name (for example two antennas)."""
     rank: LinkSettings = LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
@@ -227,7 +248,21 @@ class LinksSettings(StrictModel):
 
 
 class LogSettings(StrictModel):
-    """A log file, and facts that it does not contain."""
+    """A log file, and facts that it does not contain.
+
+    Parameters
+    ----------
+    gps_rollovers : int
+        Number of rollovers of the GPS week number in this log. Each rollover adds 1 024 weeks to the times.
+    cells : mapping of int or str to str
+        Tower of each cell, by PCI or name of the stream. Cells that are not listed are ignored.
+    height_m : float, optional
+        Height above take-off of the whole track [m], for a log without altitudes.
+    skip : list of str
+        Names of the streams of the file to ignore.
+    receiver : str
+        Name of the receiver that wrote the log, if the log does not contain it. Learned levels belong to a receiver.
+    """
 
     path: str
     reader: str | None = None
@@ -238,20 +273,15 @@ class LogSettings(StrictModel):
     clock: Literal["local", "utc", "local_as_utc"] | None = None
     time_origin: str | None = None
     gps_rollovers: Annotated[int, Field(ge=0, le=3)] = 0
-    """Number of rollovers of the GPS week number in this log. Each rollover adds 1 024 weeks to the times."""
     ri_base: Literal["zero", "one"] | None = None
     columns: dict[str, str] = {}
     kind: Kind | None = None
     unit: str | None = None
     floor_db: float = -200.0
     cells: dict[Annotated[int | str, Field(union_mode="left_to_right")], str] = {}
-    """Tower of each cell, by PCI or name of the stream. Cells that are not listed are ignored."""
     height_m: float | None = Field(default=None, ge=-1000.0, le=20_000.0)
-    """Height above take-off of the whole track [m], for a log without altitudes."""
     skip: list[str] = []
-    """Names of the streams of the file to ignore."""
     receiver: str = ""
-    """Name of the receiver that wrote the log, if the log does not contain it. Learned levels belong to a receiver."""
 
     def options(self, timezone: str | None) -> ReadOptions:
         """Return the options of the log's reader. The default time zone is that of the flight."""
@@ -275,10 +305,29 @@ class Waypoint(StrictModel):
 
 
 class PlanSettings(StrictModel):
-    """The plan and the true errors of simulated logs. ``aerpaw-cmp simulate`` writes them to truth.json."""
+    """The plan and the true errors of simulated logs. ``aerpaw-cmp simulate`` writes them to truth.json.
+
+    Parameters
+    ----------
+    start : datetime
+        Local time in the time zone of the flight.
+    offsets_db : mapping of str to mapping of str to float
+        Offset that is added to the measurement, by tower and channel. The comparison should recover it.
+    fading_db : float
+        Standard deviation of log-normal fading.
+    clock_shift_s : mapping of str to float
+        Radio clock minus telemetry clock [s], by tower.
+    bad_lines : int
+        Number of damaged lines per log file.
+    rank_k : float
+        Singular-value ratio of the simulated modem.
+    rank_error_share : float
+        Share of reports whose rank is wrong by one layer.
+    no_csi_share : float
+        Share of reports with RI 0 (no CSI).
+    """
 
     start: datetime
-    """Local time in the time zone of the flight."""
     waypoints: Annotated[list[Waypoint], Field(min_length=2)]
     speed_mps: Positive = 8.0
     climb_mps: Positive = 3.0
@@ -287,20 +336,13 @@ class PlanSettings(StrictModel):
     rss_interval_s: Positive = 0.1
     rank_interval_s: Positive = 0.5
     offsets_db: dict[str, dict[str, float]] = {}
-    """Offset that is added to the measurement, by tower and channel. The comparison should recover it."""
     fading_db: Annotated[float, Field(ge=0)] = 0.0
-    """Standard deviation of log-normal fading."""
     fading_correlation_s: Positive = 2.0
     clock_shift_s: dict[str, float] = {}
-    """Radio clock minus telemetry clock [s], by tower."""
     bad_lines: Annotated[int, Field(ge=0)] = 0
-    """Number of damaged lines per log file."""
     rank_k: Positive = 100.0
-    """Singular-value ratio of the simulated modem."""
     rank_error_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of reports whose rank is wrong by one layer."""
     no_csi_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of reports with RI 0 (no CSI)."""
 
 
 class FlightSettings(StrictModel):
@@ -315,27 +357,40 @@ class FlightSettings(StrictModel):
 
 
 class SiteChoice(StrictModel):
-    """The site of a flight, and changes to it for this flight."""
+    """The site of a flight, and changes to it for this flight.
+
+    Parameters
+    ----------
+    coordinates : str, optional
+        Name of a published coordinate set of the packaged site.
+    antenna_height_m : float, optional
+        Antenna height of every tower [m], replacing the heights of the site.
+    tower_ground : {"flat", "offsets", "surface", "dem"}, optional
+        Model of the ground at the towers and below the paths, replacing that of the site.
+    """
 
     file: str = "lake_wheeler"
     coordinates: str | None = None
-    """Name of a published coordinate set of the packaged site."""
     antenna_height_m: Positive | None = None
-    """Antenna height of every tower [m], replacing the heights of the site."""
     without_buildings: bool = False
     tower_ground: Literal["flat", "offsets", "surface", "dem"] | None = None
-    """Model of the ground at the towers and below the paths, replacing that of the site."""
 
 
 class GroundNode(StrictModel):
-    """The position or track of a node that is not in the site, such as a rover or a second UAV."""
+    """The position or track of a node that is not in the site, such as a rover or a second UAV.
+
+    Parameters
+    ----------
+    track : LogSettings, optional
+        Log with the positions of the node. A node that stays within ``STANDS_STILL_M`` is placed at their median.
+    height : {"ground", "logged"}
+        ``ground``: the antenna is ``antenna_height_m`` above the ground. ``logged``: at the height of the track.
+    """
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
     track: LogSettings | None = None
-    """Log with the positions of the node. A node that stays within ``STANDS_STILL_M`` is placed at their median."""
     height: Literal["ground", "logged"] = "ground"
-    """``ground``: the antenna is ``antenna_height_m`` above the ground. ``logged``: at the height of the track."""
     antenna_height_m: Positive = 1.5
 
     @field_validator("track", mode="before")
@@ -356,30 +411,44 @@ class GroundNode(StrictModel):
 
 
 class AdvancedRt(StrictModel):
-    """Settings of a replay that few flights need."""
+    """Settings of a replay that few flights need.
+
+    Parameters
+    ----------
+    samples : {"auto"} or int
+        Number of Sionna's rays per tower. ``auto`` increases it until two pilot runs find the same paths.
+    gamma_db_per_m, maximum_loss_db : float, optional
+        Specific attenuation and largest loss, replacing the values of P.833 at the carrier.
+    maximum_gap_s : float
+        Longest telemetry gap in which positions are interpolated.
+    """
 
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
-    """Number of Sionna's rays per tower. ``auto`` increases it until two pilot runs find the same paths."""
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None
-    """Specific attenuation and largest loss, replacing the values of P.833 at the carrier."""
     maximum_gap_s: Positive = 3.0
-    """Longest telemetry gap in which positions are interpolated."""
 
 
 class RtSettings(StrictModel):
-    """The settings of the replay of a flight."""
+    """The settings of the replay of a flight.
+
+    Parameters
+    ----------
+    diffraction : {"none", "edges"}
+        Diffraction over one edge of a building. It is included in H, levels and ranks.
+    attitude : {"logged", "level", "ignored"}
+        ``logged``: the UAV array rotates with the aircraft. ``level``: with the heading only. ``ignored``: never.
+    reflection_loss_db : float
+        Additional loss per reflection, for example by rough surfaces. Fit it on other flights.
+    """
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     diffraction: Diffraction = "none"
-    """Diffraction over one edge of a building. It is included in H, levels and ranks."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
-    """``logged``: the UAV array rotates with the aircraft. ``level``: with the heading only. ``ignored``: never."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
     leaves: Literal["in", "out"] = "in"
     reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
-    """Additional loss per reflection, for example by rough surfaces. Fit it on other flights."""
     audit_links: Annotated[int, Field(ge=0)] = 200
     advanced: AdvancedRt = AdvancedRt()
 
@@ -389,22 +458,34 @@ _WIDEST_DB = 100_000.0
 
 
 class AdvancedRss(StrictModel):
-    """Settings of the RSS comparison that few flights need."""
+    """Settings of the RSS comparison that few flights need.
+
+    Parameters
+    ----------
+    lag_window_s : float
+        Largest clock difference that is searched.
+    """
 
     lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
-    """Largest clock difference that is searched."""
 
 
 class RssSettings(StrictModel):
-    """The settings of the RSS comparison."""
+    """The settings of the RSS comparison.
+
+    Parameters
+    ----------
+    lag : {"off", "estimate", "apply"} or float
+        Radio minus telemetry clock: ``off``, ``estimate`` (only shown), ``apply``, or a value to subtract [s].
+    field : {"coherent", "power"}
+        Kind of simulated RSS that is compared.
+    minimum_height_m : float, optional
+        Lowest height of a compared sample. Samples below it are excluded and counted.
+    """
 
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
-    """Radio minus telemetry clock: ``off``, ``estimate`` (only shown), ``apply``, or a value to subtract [s]."""
     field: Literal["coherent", "power"] = "coherent"
-    """Kind of simulated RSS that is compared."""
     minimum_height_m: float | None = None
-    """Lowest height of a compared sample. Samples below it are excluded and counted."""
     advanced: AdvancedRss = AdvancedRss()
 
     @field_validator("span_db")
@@ -418,14 +499,20 @@ class RssSettings(StrictModel):
 
 
 class RankSettings(StrictModel):
-    """The settings of the rank comparison."""
+    """The settings of the rank comparison.
+
+    Parameters
+    ----------
+    minimum_height_m : float, optional
+        Lowest height of a compared sample. Samples below it are excluded and counted. Some data sets require this.
+    receiver : str, optional
+        Receiver file written by ``calibrate``, for the probability of each rank.
+    """
 
     tower: str = "LW1"
     k: Annotated[list[Positive], Field(min_length=1, max_length=64)] = [10.0, 100.0, 1000.0]
     minimum_height_m: float | None = None
-    """Lowest height of a compared sample. Samples below it are excluded and counted. Some data sets require this."""
     receiver: str | None = None
-    """Receiver file written by ``calibrate``, for the probability of each rank."""
 
     @field_validator("k")
     @classmethod
@@ -443,33 +530,49 @@ class ReportSettings(StrictModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caution:
-    """A caution about a learned antenna or receiver that the flight file names."""
+    """A caution about a learned antenna or receiver that the flight file names.
+
+    Parameters
+    ----------
+    key : str
+        Key of the flight file, such as ``antennas.uav``.
+    channel : str, optional
+        Channel that the caution concerns. None for all channels that ``link.channels`` does not name.
+    text : str
+        The antenna or receiver that is not used, with reason and substitute, or the setting that it replaces.
+    """
 
     key: str
-    """Key of the flight file, such as ``antennas.uav``."""
     channel: str | None
-    """Channel that the caution concerns. None for all channels that ``link.channels`` does not name."""
     text: str
-    """The antenna or receiver that is not used, with reason and substitute, or the setting that it replaces."""
     used: bool = False
 
 
 class FlightFile(StrictModel):
-    """All settings of a flight.yaml."""
+    """All settings of a flight.yaml.
+
+    Parameters
+    ----------
+    towers : mapping of str to GroundNode
+        Nodes of this flight that are not in the site, such as a rover.
+    trained_on : list of str
+        SHA-256 of the logs from which settings of this file were learned. These logs are not scored.
+    marks : list of str
+        Fingerprints of the same logs, to recognise copies.
+    logs : list of LogSettings
+        Logs of the flight. An empty list is sufficient for a plan or a route.
+    antennas : mapping of str to str
+        Names of learned antennas for ``uav`` and ``TOWER.CHANNEL``, replacing the antennas in ``link``.
+    """
 
     flight: FlightSettings
     site: SiteChoice = SiteChoice()
     towers: dict[str, GroundNode] = {}
-    """Nodes of this flight that are not in the site, such as a rover."""
     timezone: str | None = None
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
-    """SHA-256 of the logs from which settings of this file were learned. These logs are not scored."""
     marks: list[str] = []
-    """Fingerprints of the same logs, to recognise copies."""
     logs: list[LogSettings]
-    """Logs of the flight. An empty list is sufficient for a plan or a route."""
     antennas: dict[str, str] = {}
-    """Names of learned antennas for ``uav`` and ``TOWER.CHANNEL``, replacing the antennas in ``link``."""
     link: LinksSettings = LinksSettings()
     rt: RtSettings = RtSettings()
     rss: RssSettings = RssSettings()

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+# returns the height of the ground [m] at east and north coordinates [m], each (n,)
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
-"""Function that returns the height of the ground [m] at east and north coordinates, each (n,)."""
 
 # Largest drift of heights above take-off during a flight [m]. Real logs end as low as -3.9 m after landing.
 _DRIFT_M = 5.0

@@ -154,13 +154,18 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class LearnedTower:
-    """Learned antennas of a tower and an airframe, and the scatter of levels about them."""
+    """Learned antennas of a tower and an airframe, and the scatter of levels about them.
+
+    Parameters
+    ----------
+    moments : Moments, optional
+        Gain of both ends with its covariance, to compare it with an unknown gain.
+    """
 
     tower: MeasuredPattern
     uav: MeasuredPattern
     model: LevelModel
     moments: Moments | None = None
-    """Gain of both ends with its covariance, to compare it with an unknown gain."""
 
 
 @dataclass(frozen=True)
@@ -394,10 +399,15 @@ def _gain_of(
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedLink:
-    """Learned antennas of one tower and channel of a site."""
+    """Learned antennas of one tower and channel of a site.
+
+    Parameters
+    ----------
+    name : str
+        Name of the entry.
+    """
 
     name: str
-    """Name of the entry."""
     entry: learned.Entry
     series: learned.LearnedSeries
     tower: SpherePattern
@@ -537,17 +547,24 @@ class Receiver:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
-    """Learned antennas and receivers for a draft, by name, with their odds and the expected error."""
+    """Learned antennas and receivers for a draft, by name, with their odds and the expected error.
+
+    Parameters
+    ----------
+    antennas_about : str
+        Source and odds of the antennas, or the odds of the best ones if none fit.
+    receiver : str, optional
+        Receiver of the rank.
+    receivers : mapping of int to Receiver
+        Receivers of the levels, by the number of their log.
+    """
 
     antennas: Mapping[str, str] = field(default_factory=dict)
     antennas_about: str = ""
-    """Source and odds of the antennas, or the odds of the best ones if none fit."""
     carrier_hz: float | None = None
     receiver: str | None = None
-    """Receiver of the rank."""
     receiver_about: str = ""
     receivers: Mapping[int, Receiver] = field(default_factory=dict)
-    """Receivers of the levels, by the number of their log."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -199,12 +199,17 @@ def lock_words(lock: LearnedLock) -> str:
 
 
 class PatternsSettings(StrictModel):
-    """The measured patterns to which the learned gain is added. They are isotropic by default."""
+    """The measured patterns to which the learned gain is added. They are isotropic by default.
+
+    Parameters
+    ----------
+    towers : mapping of str to AntennaSettings
+        Patterns by ``tower.channel``, for towers with a different pattern.
+    """
 
     uav: AntennaSettings | None = None
     tower: AntennaSettings | None = None
     towers: dict[str, AntennaSettings] = Field(default_factory=dict)
-    """Patterns by ``tower.channel``, for towers with a different pattern."""
 
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
@@ -218,18 +223,26 @@ class CampaignSettings(StrictModel):
 
 
 class CalibrationFile(StrictModel):
-    """The content of a calibration.yaml."""
+    """The content of a calibration.yaml.
+
+    Parameters
+    ----------
+    flights : list of str
+        All flights, including those of ``campaigns``.
+    campaigns : mapping of str to CampaignSettings
+        Campaigns by name, if antennas are learned from several campaigns together. Each becomes an entry of the site.
+    source : Source
+        Title, DOI and licence of the data, and the airframe. They are stored with the learned models of a site.
+    rank : bool
+        True to also learn how the receiver decides its rank.
+    """
 
     calibration: _Name
     flights: Annotated[list[str], Field(min_length=1)]
-    """All flights, including those of ``campaigns``."""
     campaigns: dict[_Name, CampaignSettings] = Field(default_factory=dict)
-    """Campaigns by name, if antennas are learned from several campaigns together. Each becomes an entry of the site."""
     patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
-    """Title, DOI and licence of the data, and the airframe. They are stored with the learned models of a site."""
     rank: bool = False
-    """True to also learn how the receiver decides its rank."""
 
     @model_validator(mode="before")
     @classmethod
@@ -247,22 +260,30 @@ class CalibrationFile(StrictModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """The result of a calibration."""
+    """The result of a calibration.
+
+    Parameters
+    ----------
+    campaigns : mapping of str to str
+        Campaign of each flight, by the name of the flight.
+    locks : mapping of str to LearnedLock
+        Lock models by antenna, for receivers that lose their lock.
+    health : mapping of str to LearnedHealth
+        Usual errors of held-out flights, by antenna.
+    teaching : set of str
+        Campaigns whose UAV gain predicts most of their held-out flights. Only such a gain may be used elsewhere.
+    """
 
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
     campaigns: Mapping[str, str]
-    """Campaign of each flight, by the name of the flight."""
     observed: tuple[Observed, ...]
     learned: Learned
     scores: Mapping[str, tuple[Score, ...]]
     controls: Mapping[str, tuple[Score, ...]]
     locks: Mapping[str, LearnedLock]
-    """Lock models by antenna, for receivers that lose their lock."""
     health: Mapping[str, LearnedHealth]
-    """Usual errors of held-out flights, by antenna."""
     teaching: frozenset[str]
-    """Campaigns whose UAV gain predicts most of their held-out flights. Only such a gain may be used elsewhere."""
     warnings: tuple[str, ...]
     words: tuple[str, ...]
 

@@ -73,7 +73,15 @@ class RankGrid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankSamples:
-    """The reports of one flight at one tower with known positions. ``rank`` (n,) is NaN without CSI."""
+    """The reports of one flight at one tower with known positions. ``rank`` (n,) is NaN without CSI.
+
+    Parameters
+    ----------
+    logs : tuple of str
+        SHA-256 of the logs with the reports.
+    mark : str
+        Fingerprint of these reports, independent of their log.
+    """
 
     flight: str
     tower: str
@@ -83,9 +91,7 @@ class RankSamples:
     link: Link
     time_s: FloatArray
     logs: tuple[str, ...] = ()
-    """SHA-256 of the logs with the reports."""
     mark: str = ""
-    """Fingerprint of these reports, independent of their log."""
 
     def part(self, rows: Any) -> RankSamples:
         """Return the selected samples."""
@@ -102,17 +108,24 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedReceiver:
-    """A receiver at one tower: its indistinguishable geometries, best first, and their mean forecast."""
+    """A receiver at one tower: its indistinguishable geometries, best first, and their mean forecast.
+
+    Parameters
+    ----------
+    flights : tuple of str
+        Names of the training flights.
+    trained_on : tuple of str
+        SHA-256 of the training logs. The receiver must not be scored on them.
+    marks : tuple of str
+        Fingerprints of the training reports.
+    """
 
     tower: str
     geometries: tuple[Geometry, ...]
     tied: int
     flights: tuple[str, ...]
-    """Names of the training flights."""
     trained_on: tuple[str, ...] = ()
-    """SHA-256 of the training logs. The receiver must not be scored on them."""
     marks: tuple[str, ...] = ()
-    """Fingerprints of the training reports."""
     mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 

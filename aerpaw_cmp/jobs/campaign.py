@@ -60,7 +60,15 @@ from .workers import Lost, Workers, open_workers
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One flight file under one setting."""
+    """One flight file under one setting.
+
+    Parameters
+    ----------
+    reference : bool
+        True for the setting whose flights are compared with each other: its positions are stored.
+    key : str, optional
+        Digest of the inputs as the planning process sees them. None if an input cannot be read or there is no store.
+    """
 
     path: Path
     flight: str
@@ -68,9 +76,7 @@ class Task:
     overrides: Overrides
     logs_root: Path | None
     reference: bool = True
-    """True for the setting whose flights are compared with each other: its positions are stored."""
     key: str | None = None
-    """Digest of the inputs as the planning process sees them. None if an input cannot be read or there is no store."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,7 +79,15 @@ _GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "power sum": 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
-    """One combination of the parts of a replay."""
+    """One combination of the parts of a replay.
+
+    Parameters
+    ----------
+    media : bool
+        True if attenuating woods are media instead of single trees.
+    relief : Relief
+        Ground at the towers and below the paths, instead of that of the flight file.
+    """
 
     antennas: Antennas = "isotropic"
     attitude: Literal["ignored", "level", "logged"] = "ignored"
@@ -87,9 +95,7 @@ class Model:
     buildings: bool = False
     trees: Trees = "none"
     media: bool = False
-    """True if attenuating woods are media instead of single trees."""
     relief: Relief = "flat"
-    """Ground at the towers and below the paths, instead of that of the flight file."""
 
     @property
     def name(self) -> str:
@@ -128,13 +134,18 @@ class Model:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightComparison:
-    """The scored models, in the order of ``scores.candidates``. A model of None is that of the flight file."""
+    """The scored models, in the order of ``scores.candidates``. A model of None is that of the flight file.
+
+    Parameters
+    ----------
+    offered : mapping of str to str
+        Names of learned antennas that the site offers and the flight file does not use.
+    """
 
     scores: ModelComparison
     models: tuple[Model | None, ...]
     names: tuple[tuple[str, str], ...]
     offered: Mapping[str, str] = field(default_factory=dict)
-    """Names of learned antennas that the site offers and the flight file does not use."""
 
     @property
     def recommended(self) -> Model | None:

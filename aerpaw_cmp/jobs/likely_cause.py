@@ -297,13 +297,18 @@ def _evidence(
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Direct:
-    """The level of the direct path of a series at its poses (m,) [dBm], as set and with faults."""
+    """The level of the direct path of a series at its poses (m,) [dBm], as set and with faults.
+
+    Parameters
+    ----------
+    rotations : mapping of (str, bytes) to array
+        The attitudes by meaning of the telemetry and times, shared by all channels.
+    """
 
     site: Site
     tower: str
     replayed: Replayed
     rotations: dict[tuple[str, bytes], FloatArray]
-    """The attitudes by meaning of the telemetry and times, shared by all channels."""
 
     @property
     def place_m(self) -> FloatArray:

@@ -480,14 +480,20 @@ Levels = tuple[FloatArray, FloatArray, BoolArray]
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """The model learned from the named flights: a base, with or without a spatial correction."""
+    """The model learned from the named flights: a base, with or without a spatial correction.
+
+    Parameters
+    ----------
+    trained_on : sequence of sequence of str
+        SHA-256 of the training data of its base, in addition to the named flights.
+    marks : sequence of sequence of str
+        Fingerprints of the same data.
+    """
 
     correction: Correction
     sources: Mapping[str, Source]
     trained_on: Sequence[Sequence[str]] = ()
-    """SHA-256 of the training data of its base, in addition to the named flights."""
     marks: Sequence[Sequence[str]] = ()
-    """Fingerprints of the same data."""
 
     def levels(self, each: Sequence[LinkSamples]) -> Levels:
         """Return levels at targets, averaged over the headings ``each``."""

@@ -101,6 +101,11 @@ class Footprints:
 
     ``actions`` are sentences for the user; those that need a check begin with ``warning:``. ``credits`` name the
     sources of the data. ``assumed`` describes sizes that the maps do not state.
+
+    Parameters
+    ----------
+    ground : list of (Position, float)
+        Points of the maps with their elevation above sea level [m].
     """
 
     buildings: list[Building] = field(default_factory=list)
@@ -108,7 +113,6 @@ class Footprints:
     geofences: list[Geofence] = field(default_factory=list)
     trees: list[SingleTreeModel] = field(default_factory=list)
     ground: list[tuple[Position, float]] = field(default_factory=list)
-    """Points of the maps with their elevation above sea level [m]."""
     credits: list[str] = field(default_factory=list)
     assumed: str = ""
     actions: list[str] = field(default_factory=list)
@@ -116,7 +120,13 @@ class Footprints:
 
 @dataclass(slots=True)
 class _Shape:
-    """A projected outline before it becomes a record."""
+    """A projected outline before it becomes a record.
+
+    Parameters
+    ----------
+    assumed : bool
+        True if the map has neither height nor levels.
+    """
 
     name: str
     source: str
@@ -124,7 +134,6 @@ class _Shape:
     height_m: float = 0.0
     stated: bool = False
     assumed: bool = False
-    """True if the map has neither height nor levels."""
     material: str = "concrete"
     part: bool = False
     evergreen: float = 0.0

@@ -65,6 +65,11 @@ class Errors(StrictModel):
     ``rmse_db`` is that of held-out flights. ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are those of
     heights, azimuth sectors at the tower and headings that are not in the training flights. ``heights_m`` are cruise
     heights.
+
+    Parameters
+    ----------
+    airframe_rmse_db : float, optional
+        RMSE of the airframe of other campaigns alone, on the flights of this campaign [dB].
     """
 
     series: int
@@ -76,7 +81,6 @@ class Errors(StrictModel):
     height_rmse_db: float | None = None
     heading_rmse_db: float | None = None
     airframe_rmse_db: float | None = None
-    """RMSE of the airframe of other campaigns alone, on the flights of this campaign [dB]."""
     heights_m: list[float] = Field(default_factory=list)
 
     def expected(self, height_m: float, *, unseen: bool) -> tuple[Errors, str]:
@@ -154,22 +158,33 @@ class LearnedSpread(StrictModel):
 
 
 class LearnedPair(StrictModel):
-    """The gain towards both ends at once: its table, and the kernel that interpolates it."""
+    """The gain towards both ends at once: its table, and the kernel that interpolates it.
+
+    Parameters
+    ----------
+    sha256 : str, optional
+        SHA-256 of the table, if no index contains it.
+    """
 
     file: str
     sha256: str | None = None
-    """SHA-256 of the table, if no index contains it."""
     length: Annotated[float, Field(gt=0)]
     prior_sd_db: Annotated[float, Field(ge=0)]
 
 
 class LearnedAntenna(StrictModel):
-    """Properties of a learned antenna other than its table, as stored in a flight file or in calibrated.yaml."""
+    """Properties of a learned antenna other than its table, as stored in a flight file or in calibrated.yaml.
+
+    Parameters
+    ----------
+    sha256 : str
+        SHA-256 of the table. Another table is refused.
+    command : str
+        Command that learns the antenna again.
+    """
 
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-    """SHA-256 of the table. Another table is refused."""
     command: str
-    """Command that learns the antenna again."""
     pair: LearnedPair | None = None
     spread: LearnedSpread
 
@@ -180,6 +195,17 @@ class LearnedHealth(StrictModel):
     ``rmse_db`` is the mean over flights of the RMSE of 1-s means, with its SD. The error of 4-s means has two parts.
     ``slow_sd_db`` is correlated over a time and a length, and ``white_sd_db`` is not. The usual offset is that of
     :class:`LearnedLevel`.
+
+    Parameters
+    ----------
+    step_chi2 : float
+        Largest chi-squared of a step of the level in these flights.
+    channel_difference_sd_db : mapping of str to float
+        SD over flights of the difference of offsets to another channel of the tower, by channel.
+    below_lock_share : float, optional
+        Mean share of samples without lock. None for receivers that do not report their lock.
+    run_s : float
+        Typical length of the longest run of equal readings [s].
     """
 
     flights: int
@@ -190,13 +216,9 @@ class LearnedHealth(StrictModel):
     correlation_m: Annotated[float, Field(gt=0)]
     white_sd_db: Annotated[float, Field(ge=0)]
     step_chi2: float
-    """Largest chi-squared of a step of the level in these flights."""
     channel_difference_sd_db: dict[str, float] = Field(default_factory=dict)
-    """SD over flights of the difference of offsets to another channel of the tower, by channel."""
     below_lock_share: float | None = None
-    """Mean share of samples without lock. None for receivers that do not report their lock."""
     run_s: float
-    """Typical length of the longest run of equal readings [s]."""
 
     @property
     def most_rmse_db(self) -> float:
@@ -205,29 +227,40 @@ class LearnedHealth(StrictModel):
 
 
 class LearnedSeries(StrictModel):
-    """The antennas of one tower and channel, and the properties of the levels of that channel."""
+    """The antennas of one tower and channel, and the properties of the levels of that channel.
+
+    Parameters
+    ----------
+    channel : str
+        Label of the antenna in the training flights. Other flights may use another label.
+    receiver : str
+        Receiver to which ``level`` and ``lock`` apply, as named by ``receiver`` in a flight file. Empty if not named.
+    known_file : str
+        Name of the table of directions at the UAV in which its gain is known, with the covariance of the gain.
+    tower_known_file : str
+        Name of the table of directions at the tower in which its antenna gain is known, with the covariance.
+    sd_db : float
+        Mean standard deviation of the level over flown directions.
+    shares_airframe : bool
+        False if the gain of the UAV does not predict held-out flights of its campaign. Then it is not used elsewhere.
+    level : LearnedLevel, optional
+        Level above free space, or the level in lock for receivers that lose it.
+    """
 
     tower: str
     channel: str
-    """Label of the antenna in the training flights. Other flights may use another label."""
     receiver: str = ""
-    """Receiver to which ``level`` and ``lock`` apply, as named by ``receiver`` in a flight file. Empty if not named."""
     carrier_hz: float
     tower_file: str
     uav_file: str
     known_file: str
-    """Name of the table of directions at the UAV in which its gain is known, with the covariance of the gain."""
     tower_known_file: str
-    """Name of the table of directions at the tower in which its antenna gain is known, with the covariance."""
     pair: LearnedPair | None = None
     spread: LearnedSpread
     sd_db: float
-    """Mean standard deviation of the level over flown directions."""
     shares_airframe: bool = True
-    """False if the gain of the UAV does not predict held-out flights of its campaign. Then it is not used elsewhere."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
-    """Level above free space, or the level in lock for receivers that lose it."""
     health: LearnedHealth | None = None
 
     @property
@@ -238,11 +271,16 @@ class LearnedSeries(StrictModel):
 
 
 class LearnedReceiver(StrictModel):
-    """A rank receiver of one tower, with kappa and log score on held-out flights and for a constant forecast."""
+    """A rank receiver of one tower, with kappa and log score on held-out flights and for a constant forecast.
+
+    Parameters
+    ----------
+    quantity : str
+        Rank from which it was learned, such as ``scheduled PDSCH rank``, for any reader.
+    """
 
     tower: str
     quantity: str
-    """Rank from which it was learned, such as ``scheduled PDSCH rank``, for any reader."""
     carrier_hz: float
     file: str
     kappa: float | None = None
@@ -251,24 +289,32 @@ class LearnedReceiver(StrictModel):
 
 
 class Entry(StrictModel):
-    """The antennas and receivers of one campaign, learned by one calibration."""
+    """The antennas and receivers of one campaign, learned by one calibration.
+
+    Parameters
+    ----------
+    joined : list of str
+        Other campaigns whose flights also determine the gain of the UAV.
+    trained_on : list of str
+        SHA-256 of all logs of the calibration.
+    tables : mapping of str to str
+        SHA-256 of the tables as written. No other file is replaced or removed.
+    sha256 : str
+        SHA-256 of all other values of the entry.
+    """
 
     command: str
     made: str
     flights: list[str]
     flown: list[str]
     joined: list[str] = Field(default_factory=list)
-    """Other campaigns whose flights also determine the gain of the UAV."""
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
-    """SHA-256 of all logs of the calibration."""
     source: Source = Source()
     errors: Errors | None = None
     series: list[LearnedSeries] = Field(default_factory=list)
     receivers: list[LearnedReceiver] = Field(default_factory=list)
     tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
-    """SHA-256 of the tables as written. No other file is replaced or removed."""
     sha256: str = ""
-    """SHA-256 of all other values of the entry."""
 
     @property
     def digest(self) -> str:

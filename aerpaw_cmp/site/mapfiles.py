@@ -79,14 +79,19 @@ class TreeLine:
 
 @dataclass(slots=True)
 class MapFile:
-    """The outlines and trees of a file, sentences about other elements, and the source of the data if it is known."""
+    """The outlines and trees of a file, sentences about other elements, and the source of the data if it is known.
+
+    Parameters
+    ----------
+    ground : list of (Position, float)
+        Positions with an elevation above sea level [m] (tag ``ele``).
+    """
 
     kind: str
     credit: str = ""
     outlines: list[Outline] = field(default_factory=list)
     trees: list[TreeLine] = field(default_factory=list)
     ground: list[tuple[Position, float]] = field(default_factory=list)
-    """Positions with an elevation above sea level [m] (tag ``ele``)."""
     notes: list[str] = field(default_factory=list)
 
     def take(self, other: MapFile) -> None:

@@ -212,6 +212,8 @@ def sections(docstring: str) -> dict[str, list[str]]:
     lines = docstring.splitlines()
     for title, line in itertools.pairwise([*lines, ""]):
         if re.fullmatch(r"-{3,}", line) and title[:1].strip():
+            if by_title:
+                by_title[list(by_title)[-1]].pop()  # the title of this section
             by_title[title] = []
         elif by_title:
             by_title[list(by_title)[-1]].append(line)
@@ -257,6 +259,54 @@ def test_functions_of_four_parameters_describe_each_and_what_they_return() -> No
                 undescribed[name] = missing
     assert undescribed == {}
     assert seen > 1000
+
+
+def texts_below(tree: ast.AST) -> list[int]:
+    """Lines of strings that follow an assignment, as descriptions of a field or a constant."""
+    return [
+        after.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Module, ast.ClassDef))
+        for before, after in itertools.pairwise(node.body)
+        if isinstance(before, (ast.Assign, ast.AnnAssign))
+        and isinstance(after, ast.Expr)
+        and isinstance(after.value, ast.Constant)
+    ]
+
+
+def unknown_fields(record: ast.ClassDef, known: dict[str, ast.ClassDef]) -> set[str]:
+    """Names that the section Parameters of a record describes, and that are not fields of it or of its bases."""
+    fields: set[str] = set()
+    waiting = [record]
+    while waiting:
+        node = waiting.pop()
+        fields |= {ast.unparse(each.target) for each in node.body if isinstance(each, ast.AnnAssign)}
+        waiting += [known[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in known]
+    parts = sections(ast.get_docstring(record) or "")
+    heads = [line.split(" : ")[0] for line in parts.get("Parameters", []) if line[:1].strip()]
+    return {name.strip() for head in heads for name in head.split(",")} - fields
+
+
+def test_fields_are_described_in_the_docstring_of_their_class() -> None:
+    """A field is described under Parameters of its class, not by a string below it, and no field is left behind."""
+    trees = {path: parsed(path) for path in modules()}
+    assert {path.name: lines for path, tree in trees.items() if (lines := texts_below(tree))} == {}
+    assert texts_below(ast.parse('class A:\n    """A."""\n\n    b: int\n    """B."""')) == [5]
+    classes = [node for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    known = {node.name: node for node in classes}
+    records = [
+        node
+        for node in classes
+        if any(isinstance(each, ast.AnnAssign) for each in node.body)
+        and not any(isinstance(each, ast.FunctionDef) and each.name == "__init__" for each in node.body)
+    ]
+    assert len(records) > 350
+    assert {node.name: names for node in records if (names := unknown_fields(node, known))} == {}
+    (stale,) = ast.parse(
+        'class A:\n    """A.\n\n    Parameters\n    ----------\n    b, c : int\n    """\n\n    c: int'
+    ).body
+    assert isinstance(stale, ast.ClassDef)
+    assert unknown_fields(stale, {}) == {"b"}
 
 
 def built_by_position(tree: ast.AST, classes: set[str], most: int) -> list[tuple[int, str]]:

@@ -279,11 +279,16 @@ class CheckError(AerpawCmpError):
 
 
 class UsageError(AerpawCmpError):
-    """The error for a wrong command line or configuration file."""
+    """The error for a wrong command line or configuration file.
+
+    Attributes
+    ----------
+    others : Ingested or ()
+        Logs that were read successfully, in addition to the log that requires an option.
+    """
 
     exit_code = 2
     others: Any = ()
-    """Logs that were read successfully, in addition to the log that requires an option."""
 
 
 class InputError(AerpawCmpError):

@@ -43,12 +43,17 @@ _OptionsFor = ReadOptions | Callable[[Path], ReadOptions]
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """A file in a folder that was not read, with the reason."""
+    """A file in a folder that was not read, with the reason.
+
+    Parameters
+    ----------
+    error : AerpawCmpError, optional
+        A usage error names an option that this file needs, but perhaps not the other files of the folder.
+    """
 
     path: str
     reason: str
     error: AerpawCmpError | None = None
-    """A usage error names an option that this file needs, but perhaps not the other files of the folder."""
 
     @classmethod
     def of(cls, path: Path, names: Collection[str], error: AerpawCmpError) -> Skipped:

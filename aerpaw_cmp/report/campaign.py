@@ -40,6 +40,15 @@ class RssRow:
     ``baselines`` contains the RMSE of each baseline with its own offset, by name [dB]. ``span_db`` is the search range
     of the offset. Arrays (n,) have one value per sample, NaN if measurement or simulation is missing. Only rows of the
     first setting have these arrays; other rows have ``difference`` instead.
+
+    Parameters
+    ----------
+    start_ns : int
+        First time [ns since 1970-01-01].
+    logs : tuple of str
+        SHA-256 of the logs that contain the samples.
+    verdicts : mapping of str to str
+        Verdict of the paired interval for each baseline.
     """
 
     flight: str
@@ -67,15 +76,12 @@ class RssRow:
     position_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
     start_ns: int = 0
-    """First time [ns since 1970-01-01]."""
     difference: Moments | None = None
     held_out_offset_db: float = float("nan")
     held_out_rmse_db: float = float("nan")
     logs: tuple[str, ...] = ()
-    """SHA-256 of the logs that contain the samples."""
     mark: str = field(repr=False, default="")
     verdicts: Mapping[str, str] = field(default_factory=dict)
-    """Verdict of the paired interval for each baseline."""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -105,7 +111,15 @@ class RssRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankRow:
-    """The rank of one flight, setting, tower and K."""
+    """The rank of one flight, setting, tower and K.
+
+    Parameters
+    ----------
+    commonest_agreement : float
+        Agreement if the most frequent rank is always predicted, as a baseline.
+    logs : tuple of str
+        SHA-256 of the logs that contain the reports.
+    """
 
     flight: str
     setting: str
@@ -122,9 +136,7 @@ class RankRow:
     best_k: float
     best_k_ci95: Interval | None
     commonest_agreement: float = float("nan")
-    """Agreement if the most frequent rank is always predicted, as a baseline."""
     logs: tuple[str, ...] = ()
-    """SHA-256 of the logs that contain the reports."""
     mark: str = field(repr=False, default="")
 
 

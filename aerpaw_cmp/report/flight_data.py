@@ -49,6 +49,11 @@ class InputFile:
     """An input file. For a log, ``lines == accepted + rejected + blank``.
 
     ``rejected`` is the number of all rejected lines. ``rejected_lines`` may contain only some of them.
+
+    Parameters
+    ----------
+    learned_on : tuple of str
+        SHA-256 of the logs from which this file was learned. Empty for files that were not learned.
     """
 
     path: str
@@ -62,7 +67,6 @@ class InputFile:
     warnings: tuple[str, ...] = ()
     rejected_lines: tuple[RejectedLine, ...] = ()
     learned_on: tuple[str, ...] = ()
-    """SHA-256 of the logs from which this file was learned. Empty for files that were not learned."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,8 +33,7 @@ from ..common.units import (
 from ..compare.rank import singular_values
 from ..flight.gains import p833_note
 from ..maps import export
-from ..maps import grid as cells
-from ..maps import grid as job
+from ..maps import grid as grids
 from ..maps.evaluate import (
     LOWEST_M,
     TREATMENTS,
@@ -49,7 +48,7 @@ from ..maps.evaluate import (
     rank_fields,
 )
 from ..maps.export import maps_dataset
-from ..maps.grid import PAPER_BUDGET, Grid, LinkBudget
+from ..maps.grid import PAPER_BUDGET, Grid, Layer, LinkBudget, MapResult
 from ..maps.kriging import OrdinaryKriging, Sampling
 from ..maps.store import Reach, TileStore, Tiling, range_m
 from ..maps.variogram import BiExponential, BinnedCorrelation, field_correlation
@@ -121,10 +120,10 @@ class MapSettings:
     """
 
     foliage: tuple[str, ...] = FOLIAGE
-    spacing_m: float = cells.PAPER_SPACING_M
-    rss_altitudes_m: tuple[float, ...] = job.PAPER_RSS_ALTITUDES_M
-    rank_altitudes_m: tuple[float, ...] = job.PAPER_RANK_ALTITUDES_M
-    ks: tuple[float, ...] = job.PAPER_KS
+    spacing_m: float = grids.PAPER_SPACING_M
+    rss_altitudes_m: tuple[float, ...] = grids.PAPER_RSS_ALTITUDES_M
+    rank_altitudes_m: tuple[float, ...] = grids.PAPER_RANK_ALTITUDES_M
+    ks: tuple[float, ...] = grids.PAPER_KS
     carrier_hz: float = 3.4e9
     budget: LinkBudget = PAPER_BUDGET
     elements: int = 4
@@ -166,7 +165,7 @@ class MapSettings:
     @property
     def reach_m(self) -> float:
         """Radius of the interpolators."""
-        return self.radius_m * max(1.0, self.spacing_m / cells.PAPER_SPACING_M)
+        return self.radius_m * max(1.0, self.spacing_m / grids.PAPER_SPACING_M)
 
 
 # Settings of ``--quick``, a coarse map in seconds.
@@ -202,6 +201,10 @@ def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -
     return MapSettings(budget=budget, **(QUICK if quick else {}) | carrier | given)
 
 
+# A tile that a worker returns: maps by foliage mode, and the number of paths.
+TileDone = tuple[dict[str, MapResult], int]
+
+
 # --- the engine ----------------------------------------------------------------------------------------------------
 
 
@@ -218,7 +221,7 @@ class SiteChannels:
         reach_m = range_m(settings.carrier_hz, power_dbm, THERMAL_NOISE_DBM_HZ)
         self.reach = Reach(site, reach_m, max_depth=settings.max_depth)
         self.paths = 0
-        self._ready: dict[tuple[str, bytes], job.Evaluation] = {}
+        self._ready: dict[tuple[str, bytes], grids.Evaluation] = {}
         self._take_site(site)
 
     def _take_site(self, site: Site) -> None:
@@ -233,10 +236,10 @@ class SiteChannels:
         towers = dict.fromkeys(self.site.towers, array)
         return Link(self.settings.carrier_hz, towers, array, self.settings.budget.tx_power_dbm, uav_transmits=False)
 
-    def of(self, mode: str) -> job.Evaluate:
+    def of(self, mode: str) -> grids.Evaluate:
         """Return the evaluation of one foliage mode."""
 
-        def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> job.Evaluation:
+        def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> grids.Evaluation:
             if towers != self.names:
                 raise ValueError(f"towers {towers} are not those of the site")
             chunk = position_m.tobytes()
@@ -259,29 +262,29 @@ class SiteChannels:
         self._take_site(self.reach.of(np.array([[west, south, min(heights)], [east, north, max(heights)]])))
         self.paths = 0
         maps = self._maps(grid, progress)
-        return TileDone(maps=maps, paths=self.paths)
+        return maps, self.paths
 
-    def _maps(self, grid: Grid, progress: Callable[[float], object] | None = None) -> dict[str, job.MapResult]:
+    def _maps(self, grid: Grid, progress: Callable[[float], object] | None = None) -> dict[str, MapResult]:
         s = self.settings
         towers = {name: tower.position_m for name, tower in self.reach.site.towers.items()}
         return {
-            mode: job.map_job(
+            mode: grids.map_job(
                 grid, towers, self.of(mode), rss_altitudes_m=s.rss_altitudes_m, rank_altitudes_m=s.rank_altitudes_m,
                 ks=s.ks, progress=progress if mode == s.foliage[0] else None,
             )
             for mode in s.foliage
         }  # fmt: skip
 
-    def empty(self, grid: Grid) -> dict[str, job.MapResult]:
+    def empty(self, grid: Grid) -> dict[str, MapResult]:
         """Return maps without coverage, by foliage mode."""
         self._take_site(replace(self.reach.site, towers={}))
         return self._maps(grid)
 
-    def _all_modes(self, position_m: FloatArray) -> dict[str, job.Evaluation]:
+    def _all_modes(self, position_m: FloatArray) -> dict[str, grids.Evaluation]:
         s, n = self.settings, len(position_m)
         if not self.site.towers:
             none = np.empty((n, 0))
-            nothing = job.Evaluation(none, none, none, np.empty((n, 0, s.elements)))
+            nothing = grids.Evaluation(none, none, none, np.empty((n, 0, s.elements)))
             return dict.fromkeys(s.foliage, self._for_all_towers(nothing))
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
         search = Search(max_depth=s.max_depth)
@@ -297,10 +300,10 @@ class SiteChannels:
             covered = np.isfinite(level)
             spread = np.where(covered, level_sd_db(shaded_mimo), np.nan)
             sigma = np.where(covered[..., None], singular_values(shaded_mimo), 0.0)
-            result[mode] = self._for_all_towers(job.Evaluation(self._rss_dbm(shaded_siso), level, spread, sigma))
+            result[mode] = self._for_all_towers(grids.Evaluation(self._rss_dbm(shaded_siso), level, spread, sigma))
         return result
 
-    def _for_all_towers(self, some: job.Evaluation) -> job.Evaluation:
+    def _for_all_towers(self, some: grids.Evaluation) -> grids.Evaluation:
         """Return the evaluation of all towers. Towers that do not reach a tile are out of coverage."""
         if len(self.site.towers) == len(self.names):
             return some
@@ -312,7 +315,7 @@ class SiteChannels:
             return every
 
         siso, mimo, spread = (placed(level) for level in some.levels)
-        return job.Evaluation(siso, mimo, spread, placed(some.singular_values))
+        return grids.Evaluation(siso, mimo, spread, placed(some.singular_values))
 
     def _rss_dbm(self, h: ComplexArray) -> FloatArray:
         return rss_dbm(_beam_power(h), self.settings.budget.tx_power_dbm)
@@ -358,14 +361,6 @@ class TileOrder:
     number: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TileDone:
-    """The answer of a worker: maps by foliage mode, and the number of paths."""
-
-    maps: Mapping[str, job.MapResult]
-    paths: int
-
-
 def map_tile(order: TileOrder) -> TileDone:
     """Evaluate a tile of a map."""
     return _channels_of(order.site, order.settings).tile(order)
@@ -407,7 +402,7 @@ class MapOutcome:
 
     site: Site
     settings: MapSettings
-    maps: dict[str, job.MapResult] = field(default_factory=dict)
+    maps: dict[str, MapResult] = field(default_factory=dict)
     studies: dict[str, Study] = field(default_factory=dict)
     draws: list[Mapping[str, Score]] = field(default_factory=list)
     blocks: dict[str, Score] = field(default_factory=dict)
@@ -418,11 +413,11 @@ class MapOutcome:
     corrected: CorrectedMaps | None = None
 
     @property
-    def shown(self) -> job.MapResult:
+    def shown(self) -> MapResult:
         """The maps of the paper's mode."""
         return self.maps[self.settings.shown]
 
-    def ordered(self) -> list[tuple[str, job.MapResult]]:
+    def ordered(self) -> list[tuple[str, MapResult]]:
         """Return foliage modes and maps, the paper's mode first."""
         return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
 
@@ -478,12 +473,12 @@ def make_maps(
             _write_tiles(outcome, outcome.store, partial(crew.run, evaluate), order, stages.progress)
             outcome.tiles["store"] = str(out / ZARR)
             return outcome
-        parts: dict[int, tuple[Mapping[str, job.MapResult], int]] = {}
+        parts: dict[int, TileDone] = {}
 
         def done(number: int, result: TileDone | Lost) -> None:
             if isinstance(result, Lost):
                 raise InputError(f"a tile of the map: {result.message}")
-            parts[number] = result.maps, result.paths
+            parts[number] = result
             share(len(parts) / len(tiling))
 
         crew.run(evaluate, [order(number=number) for number in range(len(tiling))], done)
@@ -507,7 +502,7 @@ def _write_tiles(
         if isinstance(result, Lost):
             lost.append(result.message)
             return
-        store.write(missing[number], result.maps, result.paths)
+        store.write(missing[number], *result)
         progress("maps", next(written) / len(tiling))
 
     with noting_interrupts(f"{store.folder} contains the finished tiles: the same command computes the others"):
@@ -652,15 +647,14 @@ def maps_record(
     )
 
 
-def _rss_maps(result: job.MapResult, mode: str, budget: LinkBudget) -> Iterator[page.RssMap]:
-    kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
-    for antennas in kinds:
+def _rss_maps(result: MapResult, mode: str, budget: LinkBudget) -> Iterator[page.RssMap]:
+    for antennas in grids.ANTENNAS:
         for row, height in enumerate(result.rss_altitudes_m):
             for tower in (*result.tower_names, None):
                 values = result.rss(antennas, tower)[row]
                 yield page.RssMap(
                     name=f"rss_{antennas}",
-                    tower=tower or job.JOINT,
+                    tower=tower or grids.JOINT,
                     antennas=antennas.upper(),
                     height_m=height,
                     values=result.grid.raster(values),
@@ -669,18 +663,18 @@ def _rss_maps(result: job.MapResult, mode: str, budget: LinkBudget) -> Iterator[
                 )
 
 
-def _rank_maps(result: job.MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
+def _rank_maps(result: MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
     """Yield rank maps of the serving tower, or of one tower."""
     ranks, shares = result.ranks(tower), result.rank_shares(tower)
     for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
         yield page.RankMap(
-            name=f"rank_k{job.in_name(k)}",
+            name=f"rank_k{grids.in_name(k)}",
             k=k,
             height_m=height,
             values=result.grid.raster(np.where(ranks[row, column] > 0, ranks[row, column], np.nan)),
             share=shares[row, column],
             foliage=mode,
-            tower=tower or job.JOINT,
+            tower=tower or grids.JOINT,
         )
 
 
@@ -692,13 +686,12 @@ def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
         yield from outcome.corrected.rank_maps(outcome.shown.grid)
 
 
-def _linked_layers(outcome: MapOutcome) -> Iterator[job.Layer]:
+def _linked_layers(outcome: MapOutcome) -> Iterator[Layer]:
     """Yield layers for the page only: towers in coverage, and the serving tower if there are several."""
-    kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
     budget = outcome.settings.budget
     for mode, result in outcome.ordered():
-        for antennas in kinds:
-            layer = partial(job.Layer, antennas=antennas.upper(), foliage=mode)
+        for antennas in grids.ANTENNAS:
+            layer = partial(Layer, antennas=antennas.upper(), foliage=mode)
             each = budget.covered(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
             for row, height in enumerate(result.rss_altitudes_m):
                 covering = result.grid.raster(each[row].sum(axis=0))
@@ -707,18 +700,18 @@ def _linked_layers(outcome: MapOutcome) -> Iterator[job.Layer]:
         yield _serving(outcome)
 
 
-def _serving(outcome: MapOutcome) -> job.Layer:
+def _serving(outcome: MapOutcome) -> Layer:
     """Return the layer of the nearest tower."""
     shown = outcome.shown
     serving = shown.grid.raster(shown.serving.astype(np.float64))
-    return job.Layer(name="serving_tower", quantity="Serving tower", unit="", values=serving, classes=shown.tower_names)
+    return Layer(name="serving_tower", quantity="Serving tower", unit="", values=serving, classes=shown.tower_names)
 
 
-def _further_layers(outcome: MapOutcome) -> Iterator[job.Layer]:
+def _further_layers(outcome: MapOutcome) -> Iterator[Layer]:
     """Yield margin above the threshold, SNR, singular-value spread and condition number of the nearest tower."""
     budget, ratios = outcome.settings.budget, {"spread": "Singular-value spread", "condition": "Condition number"}
     for mode, result in outcome.ordered():
-        layer, raster = partial(job.Layer, unit="dB", tower=job.JOINT, foliage=mode), result.grid.raster
+        layer, raster = partial(Layer, unit="dB", tower=grids.JOINT, foliage=mode), result.grid.raster
         for height, level in zip(result.rss_altitudes_m, result.rss(), strict=True):
             if budget.level_dbm is not None:
                 above, quantity = raster(level - budget.level_dbm), f"Margin above {budget.level_dbm:.1f} dBm"
@@ -727,7 +720,7 @@ def _further_layers(outcome: MapOutcome) -> Iterator[job.Layer]:
                 above = raster(level - budget.noise_dbm)
                 yield layer(name="snr_mimo", quantity="SNR", height_m=height, values=above)
         for name, quantity in ratios.items():
-            joint = np.minimum(result.of_tower(getattr(result, f"{name}_db")), job.RATIO_LIMIT_DB)
+            joint = np.minimum(result.of_tower(getattr(result, f"{name}_db")), grids.RATIO_LIMIT_DB)
             for height, values in zip(result.rank_altitudes_m, joint, strict=True):
                 yield layer(name=name, quantity=quantity, height_m=height, values=raster(values))
 
@@ -797,14 +790,14 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     ``progress`` receives the reason if maps.nc is omitted.
     """
     site, grid, flown = outcome.site, outcome.shown.grid, outcome.corrected
-    layers: list[job.Layer] = [_serving(outcome)]
+    layers: list[Layer] = [_serving(outcome)]
     for mode, result in outcome.ordered():
         layers += _rss_maps(result, mode, outcome.settings.budget)
         for tower in (None, *result.tower_names):
             layers += _rank_maps(result, mode, tower)
     layers += _further_layers(outcome)
     corrected = [] if flown is None else [*flown.layers(grid), *flown.rank_maps(grid)]
-    joint = [layer for layer in layers if layer.tower in ("", job.JOINT) and layer.name not in RATIOS]
+    joint = [layer for layer in layers if layer.tower in ("", grids.JOINT) and layer.name not in RATIOS]
     further = [layer for layer in joint if layer.name in BUDGET]
     named = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     table = export.MapLayers(

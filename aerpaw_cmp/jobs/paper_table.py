@@ -15,7 +15,7 @@ import yaml
 from ..common.text import counted
 from ..common.units import finite_mean, power_from_db
 from ..maps.evaluate import TREATMENTS, kriging_wins, rank_fields
-from ..maps.grid import PAPER_BUDGET, Antennas
+from ..maps.grid import ANTENNAS, PAPER_BUDGET
 from ..report.maps import PaperRow
 from ..report.texts import k_key
 from .coverage_map import INTERPOLATORS, MapOutcome
@@ -82,8 +82,7 @@ def _rss(result: Any) -> dict[str, str]:
     z_at = {tower: 1.0 - np.asarray(result.coverage("siso", tower), dtype=np.float64) for tower in result.tower_names}
     lowest = {tower: float(shares[0]) for tower, shares in z_at.items()}
     shares = ", ".join(f"{tower} {_percent(share)}" for tower, share in lowest.items())
-    kinds: tuple[Antennas, Antennas] = ("mimo", "siso")
-    widths = {a: [_spread(result.rss(a)[i], 95.0) - _spread(result.rss(a)[i], 5.0) for i in rows] for a in kinds}
+    widths = {a: [_spread(result.rss(a)[i], 95.0) - _spread(result.rss(a)[i], 5.0) for i in rows] for a in ANTENNAS}
     return {
         "most_blocked": f"{max(lowest, key=lowest.__getitem__)} ({shares})",
         "least_blocked": min(lowest, key=lowest.__getitem__),

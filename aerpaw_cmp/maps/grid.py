@@ -302,6 +302,7 @@ CHUNK = 2048
 RATIO_LIMIT_DB = 180.0
 
 Antennas = Literal["siso", "mimo"]
+ANTENNAS: tuple[Antennas, ...] = ("mimo", "siso")
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,7 +57,7 @@ def in_tiles(site, chosen, cells):
     for number in range(len(tiling)):
         done.append(channels.tile(coverage_map.TileOrder(site="", settings=chosen, cells=cells, number=number)))
         buildings.append(len(channels.site.buildings))
-    maps, paths = tiling.joined((tile.maps, tile.paths) for tile in done)
+    maps, paths = tiling.joined(done)
     return maps, buildings, paths
 
 
@@ -66,8 +66,7 @@ def in_one_piece(site, chosen):
     channels = coverage_map.SiteChannels(site, chosen)
     channels.reach.of = lambda _box: site
     grid = Grid.over_area(site.area_m, chosen.spacing_m)
-    done = channels.tile(coverage_map.TileOrder(site="", settings=chosen, cells=max(grid.shape), number=0))
-    return dict(done.maps), done.paths
+    return channels.tile(coverage_map.TileOrder(site="", settings=chosen, cells=max(grid.shape), number=0))
 
 
 def assert_equal(maps, others):

@@ -251,10 +251,13 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
     time, yaw, remarks = targets.time_s, targets.yaw_deg, targets.remarks
     position = np.where(targets.known[:, None], targets.position_m, np.nan)
     if len(time) > 1 and (np.diff(time) > 0.0).all():
+        time = time - time[0]  # the times of a table may count from any instant
         wanted = _steps_s(time[-1], step_s)
         yaw = yaw[np.searchsorted(time, wanted, side="right") - 1]
         time, position = wanted, interpolated(wanted, time, position)
     known = np.isfinite(position).all(axis=1)
+    if not known.any():
+        raise InputError("no step of the route has a position", expected="neighbouring rows with positions", path=route)
     time, position, yaw = time[known], position[known], yaw[known]
     if not np.isfinite(yaw).all():
         course = bearing_deg(np.gradient(position, axis=0)) if len(position) > 1 else np.zeros(1)

@@ -372,6 +372,16 @@ def test_times_nodes_and_sizes_that_do_not_fit_are_refused(folder, capsys, tmp_p
     assert main(["channel", str(moving), "-o", str(tmp_path / "out"), "--format", "csv"]) == 0  # the others stand
 
 
+def test_a_route_begins_with_its_first_point_whatever_its_time(folder, capsys, tmp_path):
+    (folder / "from_100.csv").write_text("east_m,north_m,height_m,time_s\n50,0,30,100\n50,40,30,102\n")
+    (folder / "alone.csv").write_text("east_m,north_m,height_m,time_s\n,,,0\n50,40,30,0.5\n,,,1\n")
+    line = ["channel", str(folder / "plan.yaml"), "--tower", "LW1", "--format", "csv", "-o", str(tmp_path / "out")]
+    assert main([*line, "--route", str(folder / "from_100.csv")]) == 0
+    assert pd.read_csv(tmp_path / "out" / "channel.csv").time.tolist() == [0, 1, 2]
+    assert main([*line, "--route", str(folder / "alone.csv")]) == 3
+    assert "no step of the route has a position" in capsys.readouterr().err
+
+
 def test_a_node_of_the_flight_itself_and_a_step_longer_than_it(folder, tmp_path):
     own = folder / "node.yaml"
     place = "latitude_deg: 35.7281, longitude_deg: -78.6961, antenna_height_m: 2"

@@ -52,6 +52,10 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
         how = "the only one that moves" if len(moving) == 1 else "which is a guess"
         names = ", ".join(sheet.names[i] for i, _ in pairs)
         rows.warnings.append(f"several columns of positions ({names}): {sheet.names[latitude]!r} was used, {how}")
+        # 'rx alt' and 'rx yaw' belong to 'rx lat': find() prefers used columns
+        own, pose = {*_PLACE.sub("", sheet.plain[latitude]).split()}, ("height", "angle", "velocity", "count")
+        known = ((i, what) for i, what in enumerate(sheet.meanings) if what and own <= {*sheet.plain[i].split()})
+        sheet.used |= {i for i, what in known if what.quantity.role in pose}
     sheet.used |= {i for i in (latitude, longitude, sheet.find("altitude_m")) if i is not None}
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
     written, unfixed = np.isfinite(values[PLACE[0]]) & np.isfinite(values[PLACE[1]]), without_fix(sheet)

@@ -770,8 +770,9 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     column = _time_column(sheet, options) if column is None else column
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
-    if column is None and weeks is None and (date := sheet.find("date")) is not None and _is_dated(sheet, date):
-        column = date  # a column such as 'Date' with the date and the time of day
+    if column is None and weeks is None and (date := sheet.find("date")) is not None:
+        # a column such as 'Date' with the date and the time of day, or with fractions of days
+        column = date if _is_dated(sheet, date) or (sheet.numbers(date) % 1 > 0).any() else None
     times = (column, sheet.find("time") if weeks is not None else None, *map(sheet.find, _OF_CLOCK))
     sheet.used |= {i for i in times if i is not None}
     if weeks is not None:

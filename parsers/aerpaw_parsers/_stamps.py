@@ -551,11 +551,14 @@ _DAY_NUMBERS = (("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"), ("-001-12-3
 
 
 def _are_days(value: FloatArray, low: float, high: float) -> bool:
-    """Check whether numbers are day numbers with the time as fraction: within two days, in steps below 90 s."""
+    """Check whether numbers are day numbers with the time as fraction: within two days, in steps below 90 s.
+
+    Longer steps are also possible within half a day, because no log in seconds lasts half a second.
+    """
     finite = value[np.isfinite(value)]
-    if len(finite) < 3 or finite.min() < low or finite.max() >= high or np.ptp(finite) > 2.0:
+    if len(finite) < 3 or finite.min() < low or finite.max() >= high or not 0 < (span := np.ptp(finite)) <= 2.0:
         return False
-    return bool(0 < np.median(np.abs(np.diff(finite))) < 1e-3)
+    return bool(0 < np.median(np.abs(np.diff(finite))) < 1e-3 or span < 0.5)
 
 
 def passes_midnight(texts: Iterable[str]) -> bool:

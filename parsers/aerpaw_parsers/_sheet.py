@@ -28,7 +28,8 @@ from aerpaw_cmp.readers import OtherLines, ReadOptions, RejectedLine, Rows, buil
 
 from . import _json, _stamps
 
-SEPARATORS = (",", ";", "\t", "|")
+# Spaces are tried last: two or more between columns of fixed width, whose names may have several words, or at least one.
+SEPARATORS = (",", ";", "\t", "|", "  ", " ")
 # Largest number of lines before a header.
 TITLES = 60
 _NUMBER = re.compile(r"([-+]?\d{0,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?) ?([^\d\s,.][^\d\s]{0,9})?")
@@ -41,6 +42,9 @@ def split_row(line: bytes, separator: str) -> list[str]:
     text = line.decode("utf-8-sig", errors="replace")
     if separator == "|" and text.startswith("|"):  # a table of Markdown
         text = text.strip("| ")
+    if separator.startswith(" "):
+        between = "\t" if len(separator) > 1 else " "
+        text, separator = re.sub(f"{separator}+", between, text.strip(" #%")), between
     if '"' not in text:
         return text.split(separator)
     try:
@@ -59,7 +63,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
         if len(line) > 65_536 or b"\0" in line:
             return None
         for separator in SEPARATORS:
-            if separator.encode() not in line:
+            if separator.encode() not in line or (separator.startswith(" ") and not _is_even(lines[i:], separator)):
                 continue
             names = [name.strip() for name in split_row(line, separator)]
             below = [name.strip() for name in split_row(lines[i + 1], separator)] if i + 1 < len(lines) else []
@@ -71,6 +75,13 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
             if len(names) > 1 and is_header(filled if grouped else names) and not any(map(_stamps.is_dated, names)):
                 return i + grouped, separator, filled if grouped else names
     return None
+
+
+def _is_even(lines: Sequence[bytes], separator: str) -> bool:
+    """Check whether most lines below a header of columns between spaces have as many fields as the header."""
+    width, *below = [len(split_row(line, separator)) for line in lines[:6] if line.strip()] or [0]
+    # R and pandas write no name above the numbers of rows
+    return 2 * max(below.count(width), below.count(width + 1)) > len(below) and max(below) <= width + 1
 
 
 def starts(head: bytes, is_header: _IsHeader) -> bool:
@@ -578,8 +589,9 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     numbers = np.flatnonzero(below).tolist()
     group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
     written = list(_logical([(i, lines.raw(i)) for i in numbers], separator, len(names)))
-    if [(len(row), row[0]) for _, row in written[:3] if row[-1].strip()] == [(len(names) + 1, i) for i in "123"]:
-        names = ["", *names]  # R writes no name above the numbers of rows
+    first = "".join(row[0].strip() for _, row in written[:3] if len(row) == len(names) + 1 and row[-1].strip())
+    if first in ("123", "012"):
+        names = ["", *names]
     # the further lines of a row are comments
     comments = [*range(at + 1), *sorted({*numbers} - {i for i, _ in written})]
     header, rows, begun = _Header(_unique_names(names, group)), list[_Row](), False
@@ -592,6 +604,8 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
         rows.append(_Row(i, len(fields), len(header.place), header.placed(fields)))
         begun |= len(fields) == len(header.place)
     kept = _whole_rows(rows, header.names, numbers[-1] if numbers else at)
+    if separator.startswith(" "):  # an empty cell shifts the cells after it
+        kept = [row for row in kept if row.fields == row.width]
     text = "no row has as many fields as the header: the last columns were read as empty"
     last = kept[-1].line if kept else comments[-1]
     torn = len(lines) - 1 if lines.unterminated else -1

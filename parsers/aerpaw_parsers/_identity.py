@@ -188,7 +188,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
     found: list[int] = []
     while (repeated := table.duplicated().mean()) >= _REPEATED:
         # add the column that leaves the fewest rows with the same time and key, then look for another column
-        left = {i: table.assign(mark=sheet.texts(i)).duplicated().mean() for i in unknown if _few(sheet.texts(i))}
+        left = {i: table.assign(mark=sheet.texts(i)).duplicated().mean() for i in unknown if few(sheet.texts(i))}
         best = min(left, key=lambda i: left[i], default=-1)
         if best < 0 or left[best] > repeated - _REPEATED / 2:
             break
@@ -248,7 +248,8 @@ _CELL = ("PCI", "ARFCN", "technology", "device", "network")
 _REPEATED, _MOST_MARKS, _MOST_DOUBLE = 0.3, 16, 0.1
 
 
-def _few(texts: Iterable[str]) -> bool:
+def few(texts: Iterable[str]) -> bool:
+    """Check whether a column has several values, but not more than a table has devices or cells."""
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
@@ -262,7 +263,7 @@ _CHANGED, _SMALLER, _IN_TURN, _FEWEST = 0.3, 0.5, 0.8, 8
 def _alternates(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) -> tuple[bool, bool]:
     """Return whether a column and the level alternate together, and whether they do so in a fixed order."""
     texts = np.array(sheet.texts(column), dtype=object)
-    if column == level or not _few(texts.tolist()) or len(texts) < _FEWEST:
+    if column == level or not few(texts.tolist()) or len(texts) < _FEWEST:
         return False, False
     order = np.argsort(time, kind="stable")
     texts, values = texts[order], sheet.numbers(level)[order]

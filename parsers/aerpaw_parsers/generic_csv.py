@@ -149,6 +149,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         if len(sheet) and not any(sheet.texts(column)):
             found = f"column {sheet.names[column]!r} is empty in every row"
             raise InputError(found, expected="values", cause=_sheet.MISALIGNED)
+    if kind == "rss":
+        _refuse_other_numbers(sheet, where["rss_db"], options)
     what = sheet.meanings[where["rss_db"]] if kind == "rss" else None
     # the quantity determines the unit of an RSRP
     of_quantity = what.quantity.unit if what is not None and np.isfinite(what.quantity.can_be[0]) else ""
@@ -161,14 +163,35 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     streams: list[Stream | None] = []
     for device, of_device, table in _identity.parts(rows, sheet, "device"):
         whole, level = [("", of_device, table)], where.get("rss_db")
+        heights, about = _above_takeoff(of_device, table, where)
         divided = _identity.parts(of_device, table, *_KEYS, level=level) if kind != "telemetry" else whole
         for label, part, cells in divided:
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
-            streams.append(_stream(part, cells, kind, where, words, options.unit or unit))
+            # all cells of a device have one zero of heights
+            of_part = None if heights is None else heights[np.searchsorted(of_device.row, part.row)], about
+            streams.append(_stream(part, cells, kind, where, words, options.unit or unit, of_part))
         if kind == "rss":
-            streams.append(_track(of_device, table, where, device))
+            streams.append(_track(of_device, table, where, device, (heights, about)))
     rows.warnings += sheet.remarks()
     return rows.result(streams)
+
+
+_OF_LONG_TABLES = ("rss", "kpi", "rank", "position", "height")
+
+
+def _refuse_other_numbers(sheet: _sheet.Sheet, column: int, options: ReadOptions) -> None:
+    """Refuse powers without a unit as levels, and rows of several quantities that another column names."""
+    for i in range(len(sheet.names)):
+        named = sorted({*sheet.texts(i)}) if _identity.few(sheet.texts(i)) else []
+        known = [text for text in named if (m := dictionary.meaning(text)) and m.quantity.role in _OF_LONG_TABLES]
+        if len(known) > 1:
+            found = f"column {sheet.names[i]!r} names the quantity of each row: {', '.join(known[:4])}"
+            raise InputError(found, expected="a column per quantity", cause="a table in long form: pivot it")
+    values = sheet.numbers(column)[np.isfinite(sheet.numbers(column))]
+    if len(values) and not sheet.unit_read(column) and options.unit != "dB" and 0 < values.min() <= values.max() < 1:
+        found, name = f"all levels are between 0 and 1, such as {values[0]:.3g}", sheet.names[column]
+        expected = f"decibels, or the unit in the header: '{name} [mW]', or '{name} [linear]' for a power of full scale"
+        raise InputError(found, expected=expected, cause="linear powers")
 
 
 def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
@@ -179,7 +202,13 @@ def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
         yield i, separator, [name.strip() for name in _sheet.split_row(line, separator)]
 
 
-def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str) -> Stream | None:
+# Heights above take-off, None if they stay as they are written, and the attributes about their source.
+_Heights = tuple[FloatArray | None, _pose.Height]
+
+
+def _stream(
+    rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str, heights: _Heights
+) -> Stream | None:
     """Return the stream of mapped columns according to its kind, and flag rows with words in place of numbers."""
     options, flag = rows.options, rows.flag.copy()
     values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
@@ -187,7 +216,8 @@ def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], 
         values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
         coarse = _pose.whole_degrees([sheet.names[where[key]] for key in _pose.PLACE[:2]], values)
         rows.warnings += [f"{coarse}: is it the right column?"] if coarse else []
-    about = _above_takeoff(rows, sheet, values, where)
+    above, about = heights
+    values |= {} if above is None else {"altitude_m": above}
     odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
     add_flag(flag, odd, "no_number")
     if odd.any():
@@ -220,27 +250,28 @@ def _stream(rows: Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], 
     return rows.stream(kind, name, values, flag=flag, about=about)
 
 
-def _above_takeoff(rows: Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
-    """Convert altitudes to heights above take-off unless the header has another name or datum."""
-    height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where and "latitude_deg" in values else None
+def _above_takeoff(rows: Rows, sheet: _sheet.Sheet, where: dict[str, int]) -> _Heights:
+    """Return heights above take-off unless the header has another name or datum."""
+    height = sheet.meanings[where["altitude_m"]] if {*_pose.PLACE} <= {*where} else None
     known = height is not None and dictionary.meaning(sheet.names[where["altitude_m"]]) is not None
     if height is None or not known or height.quantity.datum in ("take-off", "ground"):
-        return {}
+        return None, {}
     rows.height_from = "assumed" if height.quantity.datum == "unknown" else "written"
-    lost = np.isnan(values["latitude_deg"])
-    values["altitude_m"], about = _pose.above_takeoff(rows, values, height.quantity.datum, lost)
-    return about
+    values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in _pose.PLACE}
+    lost = _pose.without_fix(sheet) | np.isnan(values[_pose.PLACE[0]])
+    return _pose.above_takeoff(rows, values, height.quantity.datum, lost)
 
 
-def _track(rows: Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str) -> Stream | None:
+def _track(rows: Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str, heights: _Heights) -> Stream | None:
     """Return positions in the rows of levels as the track of the flight, as in a table merged by hand."""
     names = [name for name in COLUMNS["telemetry"][:-2] if name in where]
     if not {"latitude_deg", "longitude_deg"} <= set(names):
         return None
     values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
     values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
-    about, flag = _above_takeoff(rows, sheet, values, where), no_flags(len(rows))
-    name = f"vehicle_{device}" if device else "vehicle"
+    above, about = heights
+    values |= {} if above is None else {"altitude_m": above}
+    name, flag = f"vehicle_{device}" if device else "vehicle", no_flags(len(rows))
     return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)
 
 

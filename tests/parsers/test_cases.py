@@ -146,6 +146,18 @@ def test_a_hover_at_the_start_is_no_ground(name: str, heights: list[float], grou
     np.testing.assert_allclose(shown, np.array(heights) - ground)
 
 
+@pytest.mark.parametrize(
+    ("head", "row", "refusal"),
+    [("time,power", EPOCH + ",5.9e-0{i}", "between 0 and 1"), ("time,value,field", EPOCH + ",{l},rsr{k}", "long form")],
+)
+def test_mapped_numbers_that_are_no_levels_are_refused(head: str, row: str, refusal: str, tmp_path: Path) -> None:
+    rows = [row.format(i=i, l=-90, k="pq"[i % 2]) for i in range(1, 5)]
+    (tmp_path / "x.csv").write_text("\n".join([head, *rows, ""]))
+    with pytest.raises(InputError) as refused:
+        read(tmp_path / "x.csv", ("time=time", f"{head.split(',')[1]}=rss_db"), {})
+    assert refusal in str(refused.value)
+
+
 SHIFTED = "the rows do not fit the header"
 BAD: dict[str, tuple[str, type[Exception], str]] = {
     "EST in summer": (phone("Time (EST)", LOCAL), UsageError, "-05:00 as written or -04:00"),

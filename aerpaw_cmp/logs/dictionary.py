@@ -146,6 +146,8 @@ _TRANSLATED = re.compile(
         for word in (*sorted(_WORDS, key=len, reverse=True), "[\u3040-\u9fff\uac00-\ud7af]+")
     )
 )
+# Headers copied from web pages contain zero-width spaces. Translated words may have underscores between them.
+_LETTERS = str.maketrans({"\u200b": "", "_": " ", "\u00b5": "u", "\u03bc": "u"})
 
 
 @cache
@@ -159,15 +161,15 @@ def plain(name: str) -> str:
     >>> plain("H\u00f6he [m]"), plain("\u7ecf\u5ea6")
     ('height m', 'longitude')
     """
-    # headers copied from web pages contain zero-width spaces
-    english = _TRANSLATED.sub(lambda word: f" {_WORDS.get(word[0], 'other')} ", name.lower().replace("\u200b", ""))
+    written = name.lower().translate(_LETTERS)
+    english = _TRANSLATED.sub(lambda word: f" {_WORDS.get(word[0], 'other')} ", written)
     return re.sub(r"[^a-z0-9]+", " ", english).strip()
 
 
 _BRACKETS = re.compile(r"[\[(\uff08]([^\[\]()\uff09]{1,24})[\])\uff09]")
 _BRACKET = re.compile(_BRACKETS.pattern + r"\s*$")
 # The words of 'RsrpDbm' and 'RSRPDbm', but not of 'dBm' and 'eNB'.
-_CAMEL = re.compile(r"(?<=[a-z])(?<!\b[a-z])(?<!_[a-z])(?=[A-Z])(?!Bm?$)|(?<=[A-Z0-9])(?=[dD][bB][mM]?$)")
+_CAMEL = re.compile(r"(?<=[a-z])(?<!\b[a-z])(?<!_[a-z])(?<!d[bB]u)(?=[A-Z])(?!Bm?$)|(?<=[A-Z0-9])(?=[dD][bB][mM]?$)")
 _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u03bc%\u00b0]{1,7}(/[a-z]{1,3})?")
 
 
@@ -499,6 +501,10 @@ def program(names: Collection[str]) -> Program | None:
     return next((item for item in PROGRAMS if any(sign <= present for sign in item.signs)), None)
 
 
+# The name of a MAVLink or DataFlash message in front of its fields: 'GLOBAL_POSITION_INT.lat'.
+_MESSAGE = re.compile(r"[A-Z][A-Z\d_]{2,}\.(?=\w)")
+
+
 def described(
     names: Iterable[str], *, known: Program | None = None, of: Collection[str] = ()
 ) -> tuple[Program | None, list[tuple[Meaning | None, str, str]]]:
@@ -513,6 +519,10 @@ def described(
     of : collection of str
         Further names that identify the program.
     """
+    names = [*names]
+    if len({found[0] for found in map(_MESSAGE.match, names) if found}) == 1:  # all fields are of one message
+        bare_names = [_MESSAGE.sub("", name) for name in names]
+        names = bare_names if len({*bare_names}) == len({*names}) else names
     own = [(name, plain(name)) for name in names]  # use a list, because a table may have a name twice
     present = [bare for _, bare in own]
     known = known or program([*present, *map(plain, of)])

@@ -28,7 +28,7 @@ from aerpaw_cmp.readers import OtherLines, ReadOptions, RejectedLine, Rows, buil
 
 from . import _json, _stamps
 
-# Spaces are tried last: two or more between columns of fixed width, whose names may have several words, or at least one.
+# Spaces are tried last: two or more between columns of fixed width, whose names may have several words, or one or more.
 SEPARATORS = (",", ";", "\t", "|", "  ", " ")
 # Largest number of lines before a header.
 TITLES = 60
@@ -69,9 +69,10 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
             below = [name.strip() for name in split_row(lines[i + 1], separator)] if i + 1 < len(lines) else []
             filled = [name or group for group, name in zip(names, below, strict=False)]
             # if merged cells, such as tower names, are above the names, their empty cells are filled with the names
-            # below
-            grouped = any(name and not group for group, name in zip(names, below, strict=False))
-            grouped &= len(below) == len(names) and not any(map(_VALUE.match, below))
+            # below, and names that they repeat belong to several towers
+            names_below = len(below) == len(names) and not any(map(_VALUE.match, below))
+            grouped = names_below and any(name and not group for group, name in zip(names, below, strict=True))
+            grouped |= names_below and len({*below}) < len(below) and not is_header(names)
             if len(names) > 1 and is_header(filled if grouped else names) and not any(map(_stamps.is_dated, names)):
                 return i + grouped, separator, filled if grouped else names
     return None
@@ -921,9 +922,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     count = next((short for short, c in _text.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
     if _ELAPSED.search(name):
         texts, count = [_stamps.in_seconds(text) for text in texts], count or "s"
-    # plain names have no letter for micro: 'Time [\u00b5s]' becomes 'time s'
-    if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
-        count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
+    count = count or ("s" if unit else None)
     written = dictionary.without_unit(sheet.names[column])[1] or any(c.said.search(name) for c in _text.COUNTS.values())
     if count and not written and _stamps.are_seconds(sheet.numbers(column), count):
         text = (

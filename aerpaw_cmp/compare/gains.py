@@ -1026,10 +1026,6 @@ class Evidence:
         """True if both log odds are sufficient for an airframe without the antenna of its tower."""
         return min(self.over_own, self.over_turned) >= LEAST_ODDS
 
-    def with_prior(self, odds: float) -> Evidence:
-        """Return the evidence with prior log odds against an unknown gain [nat]."""
-        return Evidence(over_own=self.over_own + odds, over_turned=self.over_turned)
-
 
 @dataclass(frozen=True, kw_only=True)
 class GainProcess:

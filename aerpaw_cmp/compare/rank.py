@@ -286,10 +286,9 @@ def histogram_test(measured: ArrayLike, simulated: ArrayLike) -> float:
 # --- what explains the modem's decision ----------------------------------------------------------------------------
 
 
-def k_grid(low: float = 1.25, high: float = 1e5, per_decade: int = 24) -> FloatArray:
-    """Return a logarithmic grid of K from ``low`` to ``high`` that contains 10, 100 and 1000 exactly if in range."""
-    first, last = np.ceil(np.log10(low) * per_decade), np.floor(np.log10(high) * per_decade)
-    k = 10.0 ** (np.arange(first, last + 1) / per_decade)
+def k_grid() -> FloatArray:
+    """Return a grid of K from 1.33 to 1e5, 24 values per decade, that contains 10, 100 and 1000 exactly."""
+    k = 10.0 ** (np.arange(3, 121) / 24)
     decade = np.round(np.log10(k))
     return np.asarray(np.where(np.isclose(k, 10.0**decade, rtol=1e-9), 10.0**decade, k))
 

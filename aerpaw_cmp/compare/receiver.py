@@ -73,10 +73,10 @@ def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
     return np.asarray(((probability - one_hot(rank, probability.shape[1])) ** 2).sum(axis=1))
 
 
-def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
-    """Return the histogram of training ranks (ranks,), with one added per rank so that no rank is impossible."""
+def constant_forecast(rank: ArrayLike) -> FloatArray:
+    """Return the histogram of training ranks (MAX_RANK,), with one added per rank so that no rank is impossible."""
     values = unmasked(rank)
-    count = np.bincount(values[values >= 1].astype(np.int64), minlength=ranks + 1)[1:] + 1.0
+    count = np.bincount(values[values >= 1].astype(np.int64), minlength=MAX_RANK + 1)[1:] + 1.0
     return np.asarray(count / count.sum())
 
 
@@ -258,8 +258,8 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
     return np.asarray((sums[..., high, :] - sums[..., low, :]) / (high - low)[:, None])
 
 
-def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8) -> IntArray:
-    """Return the sector of azimuth from the tower for each sample (n,). Sectors have about equal numbers of samples.
+def sector_groups(position_m: FloatArray, tower_m: FloatArray) -> IntArray:
+    """Return the eighth of azimuths from the tower for each sample (n,), with about equal numbers of samples.
 
     A held-out sector contains directions that the fit has not seen. Samples that are neighbours in time are mostly in
     the same sector.
@@ -269,9 +269,8 @@ def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8)
     order = np.sort(azimuth)
     gap = np.diff(np.append(order, order[0] + 2.0 * np.pi))
     turned = (azimuth - order[(np.argmax(gap) + 1) % len(order)]) % (2.0 * np.pi)
-    return np.asarray(
-        np.searchsorted(np.quantile(turned, np.arange(1, sectors) / sectors), turned, side="right"), dtype=np.int64
-    )
+    ends = np.quantile(turned, np.arange(1, 8) / 8)
+    return np.asarray(np.searchsorted(ends, turned, side="right"), dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -79,7 +79,7 @@ def idle_settings(settings: FlightFile, kinds: Collection[str]) -> list[str]:
     kinds : collection of {"rss", "rank"}
         Kinds of measurements in the logs.
     """
-    return _without_effect(settings, ((why, keys.split()) for why, keys in _reasons(settings, kinds)))
+    return _without_effect(settings, _reasons(settings, kinds))
 
 
 def _without_effect(model: BaseModel, reasons: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
@@ -90,22 +90,22 @@ def _without_effect(model: BaseModel, reasons: Iterable[tuple[str, Sequence[str]
     ]
 
 
-def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str, str]]:
+def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str, Sequence[str]]]:
     """Yield each reason with the dotted keys that have no effect because of it."""
     rt, lag = settings.rt, settings.rss.lag
     if rt.foliage != "attenuating":
-        foliage = "leaves advanced.gamma_db_per_m advanced.maximum_loss_db"
-        yield f"rt.foliage is {rt.foliage}", " ".join(f"rt.{key}" for key in foliage.split())
+        losses = ["rt.leaves", "rt.advanced.gamma_db_per_m", "rt.advanced.maximum_loss_db"]
+        yield f"rt.foliage is {rt.foliage}", losses
     if rt.max_depth == 0:
-        yield "rt.max_depth is 0, so nothing is reflected", "rt.reflection_loss_db"
+        yield "rt.max_depth is 0, so nothing is reflected", ["rt.reflection_loss_db"]
     if rt.engine == "image" and rt.audit_links == 0:
-        yield "rt.engine is image and rt.audit_links is 0, so no rays are shot", "rt.advanced.samples"
+        yield "rt.engine is image and rt.audit_links is 0, so no rays are shot", ["rt.advanced.samples"]
     if lag not in ("estimate", "apply"):
-        yield f"rss.lag is {lag}, so no clock is estimated", "rss.advanced.lag_window_s"
+        yield f"rss.lag is {lag}, so no clock is estimated", ["rss.advanced.lag_window_s"]
     if "rss" not in kinds:
-        yield "no log has levels", "rss.span_db rss.lag rss.field rss.minimum_height_m"
+        yield "no log has levels", ["rss.span_db", "rss.lag", "rss.field", "rss.minimum_height_m"]
     if "rank" not in kinds:
-        yield "no log has ranks", "rank.receiver rank.minimum_height_m"
+        yield "no log has ranks", ["rank.receiver", "rank.minimum_height_m"]
 
 
 def _differs(model: BaseModel, key: str) -> bool:

@@ -249,10 +249,6 @@ class SiteChannels:
 
         return evaluate
 
-    def try_at(self, position_m: FloatArray) -> None:
-        """Evaluate one position (3,) [m] in every mode, to raise the errors of the map before it is computed."""
-        self._all_modes(position_m[None])
-
     def tile(self, order: TileOrder, progress: Callable[[float], object] | None = None) -> TileDone:
         """Map one tile with the towers and buildings that can reach it."""
         s = self.settings
@@ -318,7 +314,9 @@ class SiteChannels:
         return grids.Evaluation(siso, mimo, spread, placed(some.singular_values))
 
     def _rss_dbm(self, h: ComplexArray) -> FloatArray:
-        return rss_dbm(_beam_power(h), self.settings.budget.tx_power_dbm)
+        """Return the level for channels (..., n_rx, n_tx) with equal feeds in phase, mean over the UAV's elements."""
+        amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
+        return rss_dbm((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), self.settings.budget.tx_power_dbm)
 
     def _above_ground(self, position_m: FloatArray) -> FloatArray:
         if self.site.dem is None:
@@ -370,12 +368,6 @@ def map_tile(order: TileOrder) -> TileDone:
 def _channels_of(site: str, settings: MapSettings) -> SiteChannels:
     """Return the channels of a site, which a worker reuses for its tiles."""
     return SiteChannels(load_site(site), settings)
-
-
-def _beam_power(h: ComplexArray) -> FloatArray:
-    """Return the received share of the transmit power for channels (..., n_rx, n_tx), with equal feeds in phase."""
-    amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
-    return np.asarray((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), dtype=np.float64)
 
 
 def level_sd_db(h: ComplexArray) -> FloatArray:
@@ -530,7 +522,8 @@ def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
 def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[PlannedStage]:
     """Return the stages of a map for its dry run. One position is mapped, so that errors of the map appear."""
     grid = Grid.over_area(place.area_m, settings.spacing_m)
-    SiteChannels(place, settings).try_at(np.append(grid.points_m[0, :2], min(settings.rss_altitudes_m, default=30.0)))
+    first_m = np.append(grid.points_m[0, :2], min(settings.rss_altitudes_m, default=30.0))
+    SiteChannels(place, settings).of(settings.shown)(first_m[None], tuple(place.towers))
     heights, tile = {*settings.rss_altitudes_m, *settings.rank_altitudes_m}, settings.tile_cells(grid)
     sides = {"position": len(grid), "height": len(heights), "tower": len(place.towers)}
     work = f"{counted(math.prod(sides.values()), 'link')}: {', '.join(counted(n, name) for name, n in sides.items())}"

@@ -123,13 +123,10 @@ class InProcess(Workers):
 class Processes(Workers):
     """Processes of this machine. If one process ends, all processes are replaced."""
 
-    def __init__(self, count: int) -> None:
-        self._count = count
+    count = 1
 
-    @property
-    def count(self) -> int:
-        """The number of processes."""
-        return self._count
+    def __init__(self, count: int) -> None:
+        self.count = count
 
     def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
         active: dict[Future[Any], int] = {}

@@ -21,6 +21,7 @@ from ..common.errors import AerpawCmpError
 from ..common.files import cache_folder
 from ..common.text import counted
 from ..propagation import llvm
+from ..propagation.compiled import thread_count
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -145,9 +146,7 @@ def _gpu_check() -> Check:
 
 def _cores_check() -> Check:
     """Report the number of processor cores that this process may use."""
-    # a container or taskset may grant fewer cores than the machine has
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Check("CPU", "ok", f"{counted(cores, 'core')}, {platform.machine()}")
+    return Check("CPU", "ok", f"{counted(thread_count(), 'core')}, {platform.machine()}")
 
 
 def available_memory_bytes(root: Path = Path("/")) -> int | None:

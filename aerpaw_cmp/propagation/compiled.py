@@ -122,7 +122,7 @@ def warn_once(reason: str) -> None:
 
 
 def thread_count() -> int:
-    """Return the number of cores that this process may use."""
+    """Return the number of cores that this process may use, fewer than the machine's in a container or taskset."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # this function does not exist on macOS and Windows

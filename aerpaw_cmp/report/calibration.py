@@ -202,12 +202,12 @@ def _directions(antenna: AntennaMap) -> FloatArray:
     return np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
 
 
-def _share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
-    """Return the share of the sphere within ``within_deg`` of a direction that a flight measured."""
+def _share_seen(antenna: AntennaMap) -> float:
+    """Return the share of the sphere within 10 degrees of a direction that a flight measured."""
     grid = _directions(antenna)
     near = np.zeros(grid.shape[:2], bool)
     for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
-        near |= (grid @ part.T > np.cos(np.radians(within_deg))).any(axis=-1)
+        near |= (grid @ part.T > np.cos(np.radians(10.0))).any(axis=-1)
     weight = np.sin(np.radians(antenna.theta_deg))[:, None] * np.ones_like(near)
     return float((near * weight).sum() / weight.sum())
 

@@ -345,19 +345,14 @@ _FEW_SETTINGS = 4
 _FEW_PAIRS = 0.25
 
 
-def rss_flights(data: CampaignData) -> list[str]:
-    """Return the flights with RSS, and those that failed. Flights with only rank have no RMSE."""
-    ranked = {row.flight for row in data.rank} - {row.flight for row in data.rss}
-    return [name for name in data.flights if name not in ranked]
-
-
 def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
-    """Return the mean RMSE over the links of each setting and flight [dB], NaN if there is none."""
+    """Return the mean RMSE over the links of each setting and flight [dB], NaN for failed flights."""
     errors: dict[tuple[str, str], list[float]] = {}
     for row in data.rss:
         errors.setdefault((row.setting, row.flight), []).append(row.rmse_db)
     means = {key: float(np.nanmean(each)) for key, each in errors.items() if np.isfinite(each).any()}
-    flights = rss_flights(data)
+    only_rank = {row.flight for row in data.rank} - {row.flight for row in data.rss}
+    flights = [name for name in data.flights if name not in only_rank]
     return {setting: {name: means.get((setting, name), np.nan) for name in flights} for setting in data.settings}
 
 

@@ -602,7 +602,7 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[Layer], st
         "degrees": geographic(data.site.frame, data.east_m, data.north_m),
         "site": plan_of(data.site),
         "borders": [listed(line) for line in data.borders_m],
-        "flown": [listed(np.round(line, 1)) for line in data.flown_m],
+        "flown": [listed(line) for line in data.flown_m],
         "joint": JOINT,
         "quantities": quantities,
         "plots": [packed(chart.content, arrays) for chart in charts],

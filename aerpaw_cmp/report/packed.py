@@ -82,12 +82,12 @@ def _steps_of(values: FloatArray, step: float) -> AnyArray:
     return np.where(finite, np.clip(scaled, -LARGEST, LARGEST), NONE["i2"]).astype(np.int16)
 
 
-def step_for(values: FloatArray, finest: float = 0.01) -> float:
+def step_for(values: FloatArray, finest: float) -> float:
     """Return the smallest step that stores all values in 16 bits: ``finest`` times a power of ten.
 
     Examples
     --------
-    >>> step_for(np.array([-140.0, 30.0])), step_for(np.array([0.0, 5000.0]))
+    >>> step_for(np.array([-140.0, 30.0]), 0.01), step_for(np.array([0.0, 5000.0]), 0.01)
     (0.01, 1.0)
     """
     array = np.asarray(values, dtype=np.float64)

@@ -97,8 +97,8 @@ def payload(
     ranges = {key: _range(key[1], values[np.isfinite(values)]) for key, values in every.items()}
     return {
         "site": None if site is None else plan_of(site),
-        "lines": [listed(np.round(np.asarray(line)[spread_out(len(line), 2000), :2], 1)) for line in lines],
-        "rings": [listed(np.round(ring[:, :2], 1)) for ring in rings],
+        "lines": [listed(np.asarray(line)[spread_out(len(line), 2000), :2]) for line in lines],
+        "rings": [listed(ring[:, :2]) for ring in rings],
         "groups": [_group(group, arrays, total, ranges) for group in groups],
         "ranks": {str(rank): CLASS_COLOURS[rank] for rank in RANKS},
         "note": note,

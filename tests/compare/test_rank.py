@@ -209,7 +209,8 @@ def test_best_k_is_found_within_its_interval():
 
 def test_the_grid_of_k_holds_the_papers_values():
     assert {10.0, 100.0, 1000.0} <= set(k_grid().tolist())
-    np.testing.assert_allclose(np.log10(k_grid()), np.arange(3, 121) / 24)  # 24 a decade, from the first above 1.25
+    np.testing.assert_allclose(np.diff(np.log10(k_grid())), 1 / 24)
+    assert k_grid()[[0, -1]] == pytest.approx([1.3335, 1e5], rel=1e-4)
 
 
 @pytest.mark.parametrize(("repeated", "verdict"), [(11, "fresh"), (12, "held")])

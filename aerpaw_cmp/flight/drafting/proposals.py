@@ -675,7 +675,8 @@ def _antennas_for(
             named_odds = _named_odds(data, series, item, receivers)
             # antennas with a different name must also fit better than any airframe with an unknown antenna
             alternative = most_alone if named_odds <= 0.0 else -math.inf
-            odds = evidence.of_link(number, item.moments, alternative).with_prior(named_odds)
+            odds = evidence.of_link(number, item.moments, alternative)
+            odds = replace(odds, over_own=odds.over_own + named_odds)
             if odds.over_own > 0.0:
                 tried.setdefault(item.name, []).append((f"{series.tower}.{series.channel}", item, odds))
     # judge the channels of a flight together: they need antennas of one entry, with one airframe

@@ -28,17 +28,14 @@ from ..geometry import BoxTree, Faces, Surfaces
 DEEPEST = 64
 
 
-def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
-    """Build a tree over boxes (n, 3). Each node is split at the median of the box centres along its longest side.
+# Largest number of items in a leaf of a tree.
+_LEAF = 4
 
-    Parameters
-    ----------
-    lower, upper : (n, 3)
-    leaf : int
-        Largest number of items in a leaf.
-    """
+
+def box_tree(lower: FloatArray, upper: FloatArray) -> BoxTree:
+    """Build a tree over boxes (n, 3). Each node is split at the median of the box centres along its longest side."""
     lower, upper = np.ascontiguousarray(lower, np.float64), np.ascontiguousarray(upper, np.float64)
-    return BoxTree(*_build(lower, upper, leaf))
+    return BoxTree(*_build(lower, upper, _LEAF))
 
 
 @kernel

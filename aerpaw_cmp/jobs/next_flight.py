@@ -312,6 +312,8 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
             for p, y in zip(place, yaw, strict=True)
         ]
         route = _raised(flown(path.name, _corners(points), plan.speed_mps), site)
+        if len(route.time_s) < 2:
+            raise InputError("the route ends within a second", cause="a hover, or one point twice", path=path)
         refused = "leaves the allowed area" if _leaves_area(route, area) else ""
         if route.duration_s > 60.0 * plan.minutes + 1.0:
             refused = f"takes {route.duration_s / 60.0:.1f} min of {plan.minutes:g} min"

@@ -43,6 +43,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "points.csv").write_text("east_m,north_m,height_m\n0,100,40\n,,\n50,120,40\n")
     (folder / "far.csv").write_text("east_m,north_m,height_m\n,,\n9000,0,40\n")
     (folder / "nowhere.csv").write_text("east_m,north_m,height_m\n,,\n")
+    (folder / "twice.csv").write_text("east_m,north_m,height_m\n0,100,40\n0,100,40\n")
     (folder / "torn.plan").write_text('{"fileType": "Plan", "mission": {')
     (folder / "long.csv").write_text("latitude_deg,longitude_deg,altitude_m\n35.72,-78.70,40\n35.74,-78.70,40\n")
     return folder
@@ -85,6 +86,7 @@ def test_plan_writes_the_best_route_and_prefers_headings(place: Path) -> None:
         (["nowhere.csv"], 3, "no point has a position"),
         (["points.csv", "--route", "torn.plan"], 3, "damaged QGroundControl plan"),
         (["points.csv", "--route", "gone.kml"], 3, "gone.kml"),
+        (["points.csv", "--route", "twice.csv"], 3, "the route ends within a second"),
         (["sphere", "--geofence", "points.csv"], 3, "without an area"),
         (
             ["sphere", "--geofence", "tangled.kml"],

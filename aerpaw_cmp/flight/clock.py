@@ -302,7 +302,7 @@ def _shown_without(bins: Mapping[str, _Bins], parts: Mapping[str, list[_Parts]],
     return True
 
 
-_NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
+_NO_OVERLAP = "too few samples have a level and a position of the UAV at every lag of the window"
 _FLAT_LEVEL = "the level is constant although the model predicts a change"
 _ONE_PLACE = "only one fifth of the flight supports a clock shift"
 _HELD = "readings are repeated for up to {:.0f} s, so levels are late although the clock may be right"

@@ -267,9 +267,8 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
     step = _MOVING_CLOCK_STEP_S if any(tower in data.nodes for tower in towers) else _CLOCK_STEP_S
     # limit the number of times, so that hours of flight cost no more than half an hour
     step = max(step, (end - start) * 1e-9 / _CLOCK_INSTANTS)
-    instants = (start + np.round(np.arange(0.0, (end - start) * 1e-9, step) * 1e9).astype(np.int64)).astype(
-        "datetime64[ns]"
-    )
+    span = max((end - start) * 1e-9, step)  # a telemetry of one row has one time
+    instants = (start + np.round(np.arange(0.0, span, step) * 1e9).astype(np.int64)).astype("datetime64[ns]")
     along: dict[tuple[str, str], Along] = {}
     alike: dict[tuple[str, float], dict[str, RssSeries]] = {}
     for series in channels:

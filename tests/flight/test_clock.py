@@ -349,6 +349,20 @@ def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
     assert [c.name for c in flight_replay.clock_channels(data, series[1:])] == ["quality"]
 
 
+def test_a_telemetry_of_one_row_is_replayed_at_its_time(monkeypatch):
+    replayed = []
+    monkeypatch.setattr(
+        flight_replay, "_along", lambda _data, _series, instants, _step: replayed.append(instants) or [ALONG]
+    )
+    monkeypatch.setattr(flight_replay, "_clock_levels", lambda *_: np.zeros(1))
+    series = SimpleNamespace(tower="LW1", channel="one", unit="dBm", time=np.zeros(1, "M8[ns]"), settings_key="one")
+    data = SimpleNamespace(
+        track=SimpleNamespace(start_ns=5, end_ns=5), nodes={}, link_of=lambda _: SimpleNamespace(carrier_hz=3.3e9)
+    )
+    flight_replay.clock_channels(data, [series])
+    assert [list(instants.astype(int)) for instants in replayed] == [[5]]
+
+
 def test_a_lag_is_excluded_only_where_no_model_explains_it():
     """Two models of the same likelihood, one of them sharp at 9 s: AFAR 328 loc 3, whose node the levels placed."""
     lags = np.arange(-15.0, 15.01, 0.5)

@@ -149,6 +149,14 @@ def test_replay_over_empty_ground_is_two_ray(scenes, distance, height, polarisat
     assert result.rss_dbm == pytest.approx(closed, abs=1e-6)
 
 
+def test_baselines_have_no_level_at_the_antenna(scenes):
+    antenna = scenes.site().towers["LW1"].position_m[None]
+    for closed in (free_space_dbm, two_ray_dbm):
+        level = closed(antenna, np.concatenate([antenna, antenna + 1.0]), 3.4e9, 40.0)[:, 0]
+        np.testing.assert_array_equal(np.isfinite(level), [False, True])
+        assert np.isnan(level[0])
+
+
 def test_turning_the_link_round_transposes_h(scenes):
     site = scenes.site(scenes.buildings(np.random.default_rng(1), 4, spread_m=60.0))
     poses = random_poses(scenes, np.random.default_rng(2), np.full(10, 60.0))

@@ -26,10 +26,11 @@ def free_space_dbm(
     Returns
     -------
     (poses, towers)
+        NaN at the position of the tower's antenna.
     """
     distance = np.linalg.norm(targets_m[:, None, :] - sources_m, axis=2)
-    with np.errstate(divide="ignore"):
-        return np.asarray(transmit_power_dbm + db_from_amplitude(wavelength_m(carrier_hz) / (4.0 * np.pi * distance)))
+    distance[distance == 0.0] = np.nan
+    return np.asarray(transmit_power_dbm + db_from_amplitude(wavelength_m(carrier_hz) / (4.0 * np.pi * distance)))
 
 
 def two_ray_dbm(
@@ -61,7 +62,7 @@ def two_ray_dbm(
     Returns
     -------
     (poses, towers)
-        NaN for poses below the ground.
+        NaN for poses below the ground and at the position of the antenna.
     """
     wavelength = wavelength_m(carrier_hz)
     across = np.linalg.norm(targets_m[:, None, :2] - sources_m[..., :2], axis=2)
@@ -79,4 +80,4 @@ def two_ray_dbm(
         extra = 4.0 * high * low / (bounced + direct)
         field = 1.0 / direct + gamma / bounced * np.exp(-2j * np.pi * extra / wavelength)
         level = transmit_power_dbm + db_from_amplitude(wavelength / (4.0 * np.pi) * np.abs(field))
-    return np.asarray(np.where(high >= 0.0, level, np.nan))
+    return np.asarray(np.where((high >= 0.0) & (direct > 0.0), level, np.nan))

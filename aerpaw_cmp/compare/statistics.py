@@ -820,7 +820,9 @@ class PairedDifference:
             return f"{size} {more} error than {other_model}, the flight is too short for an interval"
         difference, low, high = map(Printed, (self.difference_db, *self.difference_ci95_db))
         if self.verdict == "not significant":
-            return f"no significant difference from {other_model} ({difference:+.1f} dB [{low:+.1f}, {high:+.1f}])"
+            corrected_for = "" if low <= 0.0 <= high else "; corrected for the number of channels"
+            size = f"{difference:+.1f} dB [{low:+.1f}, {high:+.1f}]{corrected_for}"
+            return f"no significant difference from {other_model} ({size})"
         near, far = sorted((abs(low), abs(high)))
         digits = 1 if near >= 0.05 else 2
         return f"{self.verdict} than {other_model} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
@@ -878,8 +880,7 @@ def paired_difference(
     if len(first) >= FEWEST:
         places = None if place_m is None else place_m[finite]
         drawn = square - other_square + mean_draws(undecided(first, second), "ratio", places, of)
-        low, high = np.quantile(drawn, [0.025, 0.975])
-        squares = float(low), float(high)
+        squares = _around(square - other_square, drawn)
         scale = max(rmse + other_rmse, 1e-300)
         bounds = squares[0] / scale, squares[1] / scale
         if bounds[0] <= 0.0 <= bounds[1] and (bounds[0] < -other_rmse or bounds[1] > rmse):

@@ -290,6 +290,13 @@ def test_interval_of_a_correlation_whose_residual_goes_with_the_simulation():
     assert np.ptp(np.arctanh([low, high])) == pytest.approx(2 * 1.96 / np.sqrt(997), rel=0.3)
 
 
+def test_the_interval_of_a_paired_difference_contains_the_difference(monkeypatch):
+    """On a flight with one long trend, all draws can be on one side of the difference of the samples."""
+    monkeypatch.setattr(statistics, "mean_draws", lambda *_: np.linspace(1.0, 2.0, 100))
+    pair = paired_difference(np.tile([3.0, -3.0], 50), np.tile([2.0, -2.0], 50))
+    assert pair.difference_ci95_db == pytest.approx((1.0, (5.0 + 1.975) / 5.0), abs=0.01)
+
+
 def test_a_paired_difference_sees_what_two_intervals_of_their_own_hide():
     """Errors that share most of their shadowing: 4.0 and 4.2 dB, intervals that overlap widely, yet one is worse."""
     rng = np.random.default_rng(12)

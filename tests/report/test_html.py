@@ -186,6 +186,8 @@ class TestWords:
         assert "better than two-ray ground by 1.5 dB [1." in said(small, large)
         assert "no significant difference from two-ray ground" in said(small, rng.permutation(small))
         assert "the flight is too short for an interval" in said(small[:5], large[:5])
+        several = dataclasses.replace(paired_difference(large, small), verdict="not significant")
+        assert several.in_words("free space").endswith("; corrected for the number of channels)")
 
     def test_without_a_pair_nothing_is_judged(self, report_data):
         text = words.rss_verdict(report_data.rss[0])
@@ -200,6 +202,10 @@ class TestWords:
     def test_nothing_to_score(self, report_data):
         panel = with_numbers(report_data.rss[0], n=0, rmse_db=np.nan, offset_db=np.nan)
         assert "nothing to score" in words.rss_verdict(panel)
+        text = render(dataclasses.replace(report_data, rss=(panel,))).text
+        assert words.rss_verdict(panel) in text
+        assert "Fitted on the scored samples" not in text
+        assert "Fitted on the scored samples: offset" in render(report_data).text
 
     def test_kappa_has_its_neighbours(self, report_data):
         panel = with_numbers(

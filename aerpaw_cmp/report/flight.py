@@ -22,6 +22,7 @@ from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.referee import AVERAGED, OURS
 from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
 from ..compare.statistics import Interval
+from ..flight.clock import CANNOT_TELL
 from ..logs.records import has_wall_clock
 from . import flight_words as words
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, paragraph, settings_card
@@ -233,15 +234,17 @@ def channels_card(data: ReportData) -> Card:
 
 def _channel(data: ReportData, p: RssResult) -> Card:
     score, independent = p.score, p.score.intervals.n_effective
-    counts_as = f"The {number(score.n, 0)} samples count as about {number(independent, 0)} independent samples."
-    lag = f"Clock check: {p.clock_verdict}, radio minus telemetry {number(score.lag_s, 2, 's')}."
+    fitted = [f"Fitted on the scored samples: {', '.join(_FITTED.get(name, name) for name in score.fitted_on_scored)}."]
+    if math.isfinite(independent):
+        count = counted(round(independent), "independent sample")
+        fitted.append(f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}.")
+        fitted.append(f"The {number(score.n, 0)} samples count as about {count}.")
+    lag = f", radio minus telemetry {number(score.lag_s, 2, 's')}" if p.clock_verdict != CANNOT_TELL else ""
     return Card(
         title=p.name, group="rss-channel", chart=f"rss/{p.tower}/{p.channel}",
         text=[paragraph(
-            words.rss_verdict(p),
-            f"Fitted on the scored samples: {', '.join(_FITTED.get(name, name) for name in score.fitted_on_scored)}.",
-            f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}.",
-            counts_as if math.isfinite(independent) else "", lag if p.clock_verdict else "",
+            words.rss_verdict(p), *(fitted if score.n else ()),
+            f"Clock check: {p.clock_verdict}{lag}." if p.clock_verdict else "",
         )],
         parts=[Card(tables=[_spans(data, p.time, p.spans, f"Segments with the largest error, {p.name}.")])],
     )  # fmt: skip

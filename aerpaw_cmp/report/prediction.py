@@ -80,6 +80,7 @@ EXPECTED = (
     "Expect an RMSE of {error:.1f} dB{over} at these points on a new flight ({heading}); 90 % of the samples "
     "lie within \u00b1{band:.1f} dB."
 )
+NOWHERE = "No level is predicted: no path reaches any of the points."
 LOCK = "The receiver is in lock for {percent:.0f} % of them (P(lock) of each point: `p_lock` in prediction.csv)."
 REMEMBERED = "No flight is named: antennas and levels are those learned at this site."
 OUTSIDE = {
@@ -136,7 +137,8 @@ def first_words(
     str
     """
     over = " over 4 s means" if lock is None else ""
-    texts = filled([EXPECTED], error=expected_db, band=band_db, heading=heading, over=over)
+    known = [EXPECTED] if np.isfinite(expected_db) else [NOWHERE]
+    texts = filled(known, error=expected_db, band=band_db, heading=heading, over=over)
     texts += [] if lock is None else filled([LOCK], percent=100.0 * lock)
     step = ""
     if correction is None:

@@ -54,6 +54,12 @@ def test_equal_models_are_called_neither_better_nor_worse() -> None:
     assert "worse" not in words
 
 
+def test_points_without_a_path_have_no_expected_error() -> None:
+    words = first_words(None, 0.0, float("nan"), float("nan"))
+    assert words.startswith("No level is predicted: no path reaches any of the points.")
+    assert "nan" not in words
+
+
 def test_two_flights_give_no_interval_as_in_a_calibration() -> None:
     """However many samples they have: 600 independent ones would bound the difference to some tenths of a decibel."""
     errors = {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}

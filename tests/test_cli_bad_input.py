@@ -96,6 +96,8 @@ def test_bad_logs(run: Run, name: str, files: dict[str, bytes | str | None], cod
         (("  - {path: power_log.txt, reader: sounder_log, node: LW1, channel: USRP1}\n", ""), "RSS or rank"),
         (("  - {path: vehicleOut.txt, reader: vehicle_out}\n", ""), "no telemetry"),
         (("rt: {audit_links: 0}", "rt: {audit_links: 0, max_depth: 9}"), "max_depth"),
+        (('rss: {lag: "off"}', "rss: {advanced: {lag_window_s: 0.01}}"), "lag_window_s"),
+        (("rt:", "link: {rss: {carrier_hz: 60e9}}\nrt:"), "Next: fix flight.yaml and run the same command"),
     ],
 )
 def test_bad_flight_files(run: Run, change: tuple[str, str], words: str) -> None:
@@ -103,6 +105,18 @@ def test_bad_flight_files(run: Run, change: tuple[str, str], words: str) -> None
     code, err = run(FLIGHT.replace(*change))
     assert code == 2, err
     assert words in err
+
+
+def test_arrays_with_more_ranks_than_a_modem_reports_are_refused(run: Run) -> None:
+    array = "{layout: linear, elements: 8}"
+    link = f"link: {{rank: {{carrier_hz: 3.4e9, tower: {array}, uav: {array}}}}}"
+    ranks = "".join(f"{i},2025-06-01 10:00:{i:02d}.000,-78.6960,35.7274,20,3\n" for i in range(1, 39))
+    code, err = run(
+        FLIGHT.replace("rt:", f"  - {{path: ri.txt, reader: quectel_ri, node: LW1}}\n{link}\nrt:"),
+        ri="ID,Time and date,Longitude,Latitude,Altitude,NR RI\n" + ranks,
+    )
+    assert code == 2, err
+    assert "link.rank of LW1 has more than 4 elements at both ends" in err
 
 
 def test_nan_positions_are_left_out_not_fatal(run: Run) -> None:

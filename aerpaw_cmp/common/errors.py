@@ -346,6 +346,9 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
             return f"the same command with {one_line(str(settings[0]))}"
         if not settings and words[:1] in _OF_LOGS:
             return f"'aerpaw-cmp ingest {one_line(str(place))} --draft flight.yaml' writes one from its logs"
+    settings_file = next((word for word in arguments if word.endswith(_SETTINGS)), None)
+    if place is None and settings_file and words[:1] == ["report"] and "--" not in f"{error.found} {error.expected}":
+        return f"fix {one_line(Path(settings_file).name)} and run the same command"
     if place is None or not isinstance(error, InputError):
         return f"'{command} --help' lists the options"
     if not _exists(place):

@@ -13,12 +13,13 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from ..common.errors import InputError
+from ..common.errors import InputError, UsageError
 from ..common.stages import Progress, Stages, logged
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import Observed
 from ..compare.gains import LinkSamples, link_directions
+from ..compare.rank import MAX_RANK
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.drivers import replay_in_parts, replay_moving
 from ..propagation.edges import diffracted
@@ -384,6 +385,11 @@ def replay_rank(data: FlightData, progress: Progress = logged) -> list[Replayed]
     out = []
     for series in data.rank:
         link = data.link_of(series)
+        if min(len(link.uav_array), len(link.tower_arrays[series.tower])) > MAX_RANK:
+            raise UsageError(
+                f"link.rank of {series.tower} has more than {MAX_RANK} elements at both ends",
+                expected=f"at most {MAX_RANK} elements at one end, because modems report ranks up to {MAX_RANK}",
+            )
         poses, valid, track = rank_poses(data, series)
         towers_m = data.tower_at(series.tower, series.time)[0][valid] if series.tower in data.nodes else None
         progress(f"replay rank {series.tower}: {counted(len(poses), 'pose')}")

@@ -466,7 +466,7 @@ class AdvancedRss(StrictModel):
         Largest clock difference that is searched.
     """
 
-    lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
+    lag_window_s: Annotated[float, Field(ge=0.1, le=3600)] = 15.0
 
 
 class RssSettings(StrictModel):

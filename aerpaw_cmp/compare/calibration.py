@@ -740,8 +740,11 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
             _Fold([s for s in series if s.flight not in group], [s for s in series if s.flight in group])
             for group in groups_of(names)[: None if len(names) <= MOST_GROUPS else _SCORED_GROUPS]
         ]
-    cells = [np.floor(s.position_m[:, :2] / BLOCK_M).astype(np.int64) for s in series]
-    every, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
+    size_m, every = 2.0 * BLOCK_M, np.empty(0)
+    while len(every) < 2 and size_m > 1.0:  # smaller blocks for a flight inside one block
+        size_m /= 2.0
+        cells = [np.floor(s.position_m[:, :2] / size_m).astype(np.int64) for s in series]
+        every, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
     out = []
     for cell in every[np.argsort(-count)[:6]]:
         inside: list[IntArray] = [np.flatnonzero((c == cell).all(axis=1)) for c in cells]
@@ -815,7 +818,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     Raises
     ------
     InputError
-        If no sample has a level and a pose.
+        If no sample has a level and a pose, or all samples are at one position.
     """
     series = [s for s in series if np.isfinite(s.residual_db).any()]
     if not series:
@@ -829,6 +832,8 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
                 many = len({s.flight for s in series}) > MOST_GROUPS
                 _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
     joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
+    if not joined:
+        raise InputError("all samples are at one position, so no model can be tested", expected="a flight over an area")
     left_out = [s for fold in folds if fold.known for s in fold.left_out if np.isfinite(s.residual_db).any()]
     place = np.concatenate([np.zeros((0, 3)), *(s.binned(BIN_S).position_m for s in left_out)])
     # scale standard deviations before scoring, so that the CRPS compares errors

@@ -241,7 +241,7 @@ def _model_fields(
             "sd_factor": correction.sd_factor,
             "rmse_db": correction.rmse_db[key],
             "crps_db": correction.crps_db[key],
-            "left_out": "flights" if len(correction.flights) > 1 else "300 m blocks",
+            "left_out": "flights" if len(correction.flights) > 1 else "blocks",
         },
     }
 

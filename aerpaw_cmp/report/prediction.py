@@ -147,7 +147,7 @@ def first_words(
         if ("free space", OFF) in correction.rmse_db and (correction.base, correction.title) != ("free space", OFF):
             verdict = _against_free_space(correction)
             near, far = sorted(map(abs, verdict.interval))
-            over = "flights" if len(correction.flights) > 1 else "300 m blocks"
+            over = "flights" if len(correction.flights) > 1 else "blocks of the flight"
             texts.append(said_of(verdict, AGAINST_FREE_SPACE, over=over, near=near, far=far))
         step = _stated(correction).partition("Next: ")[2]
     texts.append(PLAN if outside > MANY else f"Next: {step}" if step else "")

@@ -189,6 +189,15 @@ def test_a_single_flight_is_scored_block_by_block_with_its_own_offset() -> None:
         np.testing.assert_allclose(choice.held_out["made", title][1], choice.sd_factor * sd, rtol=1e-9)
 
 
+def test_a_flight_inside_one_block_is_scored_in_smaller_ones() -> None:
+    place = np.random.default_rng(1).uniform([10, 10, 30], [90, 90, 50], (120, 3))
+    alone = samples("a", np.random.default_rng(2).normal(5.0, 2.0, 120), place)
+    choice = choose([alone], {"made": fixed_base(gain)})
+    assert np.isfinite(choice.held_out["made", choice.title][0]).sum() == 120
+    with pytest.raises(InputError, match="all samples are at one position"):
+        choose([samples("a", np.ones(120), np.full((120, 3), 40.0))], {"made": fixed_base(gain)})
+
+
 def test_of_many_flights_three_groups_of_six_are_scored_and_scales_are_learned_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -67,7 +67,7 @@ def test_two_flights_give_no_interval_as_in_a_calibration() -> None:
     assert re.search(r"differs from free space by −?-?[23]\.\d dB; no interval from two flights", words)
     assert "95 %" not in words
     single = first_words(correction(LEARNED, errors, 3.0, ("a",)), 0.0, 4.2, 7.5)
-    assert "On held-out 300 m blocks it is" in single
+    assert "On held-out blocks of the flight it is" in single
     assert "(95 %)" in single
 
 

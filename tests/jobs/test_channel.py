@@ -221,6 +221,15 @@ def test_the_frequency_response_is_the_channel_at_another_carrier(written, folde
     assert np.linalg.norm(complex_of(book, "h") - h) > 0.5 * np.linalg.norm(h), "the phase turns between the two"
 
 
+def test_a_route_out_of_coverage_is_written_in_every_format(folder):
+    weak = {"{carrier_hz: 3.4e9": "{carrier_hz: 3.4e9, transmit_power_dbm: -150"}
+    out, book = along(folder, "weak", weak, *FORMATS)
+    table = pd.read_csv(out / "channel.csv")
+    assert len(table) == 32
+    assert table[["gain_db", "delay_s"]].isna().all(axis=None)
+    assert (book.kind == -1).all()
+
+
 @pytest.mark.parametrize("uav_transmits", ["false", "true"])
 def test_angles_of_a_deepmimo_scenario_leave_the_tower_whoever_transmits(uav_transmits, folder):
     """Its towers are the transmitters: departure looks from the tower to the UAV, arrival back."""

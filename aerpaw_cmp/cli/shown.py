@@ -183,7 +183,7 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
 
 def number(value: float | None, form: str) -> str:
     """Return a number as text in the given format, or a dash if the number is missing."""
-    return "-" if value is None else form.format(value)
+    return "-" if value is None or math.isnan(value) else form.format(value)
 
 
 def records(items: Sequence[Any], columns: Mapping[str, str], title: str | None = None) -> None:

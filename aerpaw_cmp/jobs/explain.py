@@ -129,6 +129,8 @@ def run_explain(
     paths = explain_paths(replayed.paths, replayed.faces, source, pose, link, further)
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv has rss.field: {settings.rss.field}; the level here is the coherent sum")
+    if paths and np.isnan(replayed.rss_dbm[0, 0]):
+        notes.append(f"out of coverage: the coherent sum is below the noise floor of {link.noise_floor_dbm:.1f} dBm")
     notes += further_path_lines(replayed, np.asarray(source), pose, link)
     measured = float(series.measured_db[at]) if isinstance(series, RssSeries) and len(series.log) else None
     return Explanation(

@@ -62,6 +62,17 @@ def test_terms_add_up_to_the_level_of_the_report(flown, tower):
     assert {"foliage", "reflection 1", "polarisation", "UAV antenna"} <= seen
 
 
+def test_a_link_below_the_noise_has_a_dash_and_the_reason(flown, capsys, tmp_path):
+    path, _ = flown
+    weak = tmp_path / "weak.yaml"
+    weak.write_text(path.read_text().replace("carrier_hz:", "transmit_power_dbm: -200\n    carrier_hz:", 1))
+    command = ["explain", str(weak), "--time", "2", "--tower", "LW1", "--logs-root", str(path.parent)]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "coherent sum - dBm" in printed
+    assert "below the noise floor of -174" in printed
+
+
 def test_command_line_and_json(flown, capsys):
     path, _ = flown
     assert main(["explain", str(path), "--time", "4", "--tower", "LW1", "--json", "--quiet"]) == 0

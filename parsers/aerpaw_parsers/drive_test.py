@@ -374,6 +374,7 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         )
     ]  # fmt: skip
     _name_others(rows, sheet, cells, others)
+    ranks = [i for i in ranks if not _numbers_cells(rows, sheet, i)]
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]
     # without a level or rank, the ratio to the noise is the receiver's level
@@ -418,6 +419,21 @@ def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
         "the table is from a scheduler of the uplink: its signal-to-noise ratios are not levels of the downlink"
     )
     return True
+
+
+def _numbers_cells(rows: Rows, sheet: _sheet.Sheet, column: int) -> bool:
+    """Check whether the ranks at most times are 1, 2, 3 ..: an order of cells, such as that of a scanner."""
+    table = pd.DataFrame({"time": rows.time, "rank": sheet.numbers(column)}).dropna()
+    of_time = table.groupby("time")["rank"].agg(["size", "nunique", "min", "max"])
+    listed = (of_time["size"] > 1) & (of_time[["nunique", "max"]].eq(of_time["size"], axis=0)).all(axis=1)
+    if not len(listed) or (listed & of_time["min"].eq(1)).mean() <= _NUMBERED:
+        return False
+    rows.warnings.append(f"column {sheet.names[column]!r} numbers the rows of each time: not a rank of the channel")
+    return True
+
+
+# Smallest share of times at which an order of cells is complete.
+_NUMBERED = 0.8
 
 
 def _short(sheet: _sheet.Sheet, column: int) -> str:

@@ -278,9 +278,10 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 
 def _way_out(head: bytes) -> str:
     titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
-    first, *below = (line.decode("utf-8", "replace").strip() for line in titled.split(b"\n")[:20])
-    # the most frequent sign is the separator, because decimal commas are rarer
-    sign = max(",;\t|", key=first.count)
+    lines = [line.decode("utf-8", "replace").strip() for line in titled.split(b"\n")[:20]]
+    # the most frequent sign is the separator, because decimal commas are rarer; titles have fewer separators than names
+    sign = max(",;\t|", key="".join(lines).count)
+    first, *below = lines[max(range(len(lines)), key=lambda i: lines[i].count(sign)) :]
     names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
         if len(head) == HEAD_BYTES and b"\n" not in head:
@@ -323,7 +324,8 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
     if not (fits["latitude_deg"] and fits["longitude_deg"]):
         fits = {what: fits[what] for what in ("time", "rss_db")}
     pairs = [f"--map {named[0]!r}={what}" for what, named in fits.items() if named]
-    return f"a table of another kind: name its columns: {' '.join(pairs)}"
+    others = f" (or {', '.join(map(repr, fits['rss_db'][1:4]))})" if fits["rss_db"][1:] else ""
+    return f"a table of another kind: name its columns: {' '.join(pairs)}{others}"
 
 
 def _excerpt(head: bytes) -> str:

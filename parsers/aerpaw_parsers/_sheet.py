@@ -262,20 +262,22 @@ class Sheet:
     def unit(self, column: int) -> str:
         """Return the unit in the name of a column, or that of its program, or an empty text."""
         what, unit, _ = self._described[1][column]
-        if not unit and what is not None and what.quantity.role == "rss":
-            return self._unit_of_levels
+        if not unit and what is not None:
+            unit = self._units.get("rss" if what.quantity.role == "rss" else self._own[column], "")
         written = what is not None and what.unit
         return unit if written or unit not in dictionary.OF_INTEGERS or self._in_integers else ""
 
     @cached_property
-    def _unit_of_levels(self) -> str:
-        """Return the unit of levels in a column such as ``unit`` with ``dBW`` in every row, or an empty text."""
+    def _units(self) -> dict[str, str]:
+        """The units of levels (key ``rss``) and of other columns, which a column such as ``alt unit`` contains."""
+        found = {}
         for i, name in enumerate(self._own):
-            texts = {cells[i].strip().lower() for cells in self.cells} if re.fullmatch(r"(.* )?units?", name) else set()
-            if len(texts) == 1 and dictionary.is_unit(text := texts.pop()):
+            of_what = re.fullmatch(r"(?:(.*) )?units?", name)
+            texts = {cells[i].strip().lower() for cells in self.cells} if of_what else set()
+            if of_what and len(texts) == 1 and dictionary.is_unit(text := texts.pop()):
                 self.used.add(i)
-                return text
-        return ""
+                found["rss" if dictionary.unit_of(text) in _OF_LEVELS else of_what[1] or ""] = text
+        return found
 
     def unit_read(self, column: int) -> str:
         """Return the unit of :meth:`numbers`, empty if the brackets contain other text, such as ``(LTE scell0)``."""
@@ -420,6 +422,12 @@ class Sheet:
         said = [text for i, text in sorted(self.notes.items()) if i not in idle]
         if left:
             said.append(f"not read, though they look like levels, identities, positions or times: {shown}{more}")
+        words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
+        if words:
+            shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
+            said.append(
+                f"not read: {shown}. If one of them names the cell or device of a row, call it 'cell' or 'device'"
+            )
         gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         if gains:
             text = "changes, and levels are not corrected for it: do they already include it?"
@@ -443,9 +451,19 @@ class Sheet:
             # an index of the level of an unknown radio access, where no level is read
             levels = (what for i in self.used if (what := self.meanings[i]) and what.quantity.role == "rss")
             like |= _ASU.search(words) is not None and not any(levels)
+            like |= dictionary.PATTERNS["neighbour"].search(words) is not None
             # angles in columns of other names, such as x and y
             like |= self.find("latitude_deg") is None and _is_angle(self.numbers(column))
         return like and any(text.lower() not in NO_VALUE for text in self.texts(column))
+
+    def _may_name(self, column: int) -> bool:
+        """Check whether a column with an unknown name has a few texts that may be names of cells or devices."""
+        if self.meanings[column] is not None or dictionary.PATTERNS["no_identity"].search(self.plain[column]):
+            return False
+        texts = {text.lower() for text in self.texts(column)} - {*NO_VALUE, *_YES_OR_NO}
+        return 1 < len(texts) <= _MOST_SOURCES and all(
+            _LETTER.search(text) and math.isnan(_number(text)[0]) for text in texts
+        )
 
 
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
@@ -454,6 +472,9 @@ _ASU = re.compile(r"\basu\b")
 _GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(uation|uator)?)\b")
 # Largest share of rows that are equal to another row: rows within one second may be equal.
 _MOST_EQUAL = 0.3
+_YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
+# Names contain a letter. A column with more texts than this counts something.
+_LETTER, _MOST_SOURCES = re.compile(r"[^\W\d_]"), 16
 # Largest number of column names in one sentence.
 _MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
@@ -810,9 +831,10 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     if len(timed) < len(sheet):  # rows without a time are rejected
         sheet.row, sheet.cells = sheet.row[timed.at], [sheet.cells[i] for i in timed.at.tolist()]
         sheet._numbers.clear()
-    if (counter := sheet.named("time millisecond", "millisecond", "milliseconds", "msec", "ms")) not in (None, column):
-        sheet.used.add(counter)
-        _add_milliseconds(timed, sheet.numbers(counter))
+    for per_ms, names in ((1.0, ("time millisecond", "millisecond", "milliseconds", "msec", "ms")), (1e6, _NSECS)):
+        if (counter := sheet.named(*names)) not in (None, column):
+            sheet.used.add(counter)
+            _add_milliseconds(timed, sheet.numbers(counter) / per_ms)
     if (valid := sheet.named("valid", "is valid", "data valid")) is not None:
         words = ("0", "0.0", "false", "no", "n", "invalid")
         invalid = np.array([text.lower() in words for text in sheet.texts(valid)], dtype=bool)
@@ -823,6 +845,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     return timed
 
 
+_NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds")
 _OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
 # Start of a log in a cell of JSON, written by Open DroneLog together with relative times.
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
@@ -924,16 +947,22 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         texts, count = [_stamps.in_seconds(text) for text in texts], count or "s"
     count = count or ("s" if unit else None)
     written = dictionary.without_unit(sheet.names[column])[1] or any(c.said.search(name) for c in _text.COUNTS.values())
-    if count and not written and _stamps.are_seconds(sheet.numbers(column), count):
-        text = (
-            f"read as seconds, although {sheet.program.name if sheet.program else 'the program'} usually writes {count}"
+    are_seconds = count is not None and _stamps.are_seconds(sheet.numbers(column), count)
+    if are_seconds and (not written or _EPOCH_S[0] < np.nanmedian(sheet.numbers(column)) < _EPOCH_S[1]):
+        who = (
+            "its name contains"
+            if written
+            else f"{sheet.program.name if sheet.program else 'the program'} usually writes"
         )
+        text = f"read as seconds, although {who} {count}"
         sheet.notes[column], count = f"column {sheet.names[column]!r}: {text}", None
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
     if day is not None and not zone and "local" not in name:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
     if day is not None and "local" in sheet.names[day].lower() and zone == "UTC":
         text = "dates are local but times are UTC: between midnight in the two zones, the date is wrong by a day"
+        if _stamps.passes_midnight(sheet.texts(column)):
+            raise InputError(text, expected="dates and times of one zone", cause="two clocks in one table")
         sheet.notes[day] = f"columns {sheet.names[day]!r} and {sheet.names[column]!r}: {text}"
     if (beside := sheet.find("zone")) is not None:
         zone, texts = _zone_column(sheet, beside, zone, texts, options)
@@ -949,6 +978,10 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         sheet.notes[day] = f"column {sheet.names[day]!r}: {text}"
         texts, options = clocks, replace(options, time_origin=read(sheet.texts(day)[:1], options)[1][0].decode()[:10])
     return read(texts, options)
+
+
+# Epochs of 2009 and 2049 [s].
+_EPOCH_S = (1.23e9, 2.5e9)
 
 
 def _devices(sheet: Sheet) -> IntArray | None:
@@ -1135,6 +1168,9 @@ def _add_milliseconds(rows: Rows, milliseconds: FloatArray) -> None:
     counted_ns = np.round(np.where(known, milliseconds, 0.0) * 1e6)
     fits = np.abs(counted_ns).max() < _MOST_NS
     counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
+    if (counted >= 0).all() and (counted < 1_000_000_000).all():  # fractions of each second, no count since the start
+        rows.time = (time + counted).astype("datetime64[ns]")
+        return
     zero = (time - counted)[known]
     if not fits or zero.max() - zero.min() > _MOST_APART_NS:
         rows.warnings.append("the column of milliseconds does not fit the times and is not used")

@@ -474,7 +474,7 @@ _GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(
 _MOST_EQUAL = 0.3
 _YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
 # Names contain a letter. A column with more texts than this counts something.
-_LETTER, _MOST_SOURCES = re.compile(r"[^\W\d_]"), 16
+_LETTER, _MOST_SOURCES = re.compile(r"[^\W\d_]"), 50
 # Largest number of column names in one sentence.
 _MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
@@ -1168,11 +1168,11 @@ def _add_milliseconds(rows: Rows, milliseconds: FloatArray) -> None:
     counted_ns = np.round(np.where(known, milliseconds, 0.0) * 1e6)
     fits = np.abs(counted_ns).max() < _MOST_NS
     counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
-    if (counted >= 0).all() and (counted < 1_000_000_000).all():  # fractions of each second, no count since the start
-        rows.time = (time + counted).astype("datetime64[ns]")
-        return
     zero = (time - counted)[known]
     if not fits or zero.max() - zero.min() > _MOST_APART_NS:
+        if fits and (counted >= 0).all() and (counted < 1_000_000_000).all():
+            rows.time = (time + counted).astype("datetime64[ns]")  # fractions of each second, no count since the start
+            return
         rows.warnings.append("the column of milliseconds does not fit the times and is not used")
         return
     rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")

@@ -196,10 +196,10 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,
         "--map 'when_utc'=time --map 'rx_power_dbm'=rss_db$"),
     "channels of a receiver": (
-        table("time,temp,USRP1,USRP2", EPOCH + ",-5,{l},{l}"), InputError, "--map 'time'=time --map 'USRP1'=rss_db$"),
+        table("time,temp,USRP1,USRP2", EPOCH + ",-5,{l},{l}"), InputError, "--map 'USRP1'=rss_db .or 'USRP2'.$"),
     "two powers of nobody": (
         table("elapsed_time,utc_stamp,node,raw_dbfs,cal_dbm", f"{{i}},{EPOCH},A,{{l}},{{l}}"), InputError,
-        "--map 'utc_stamp'=time --map 'cal_dbm'=rss_db$"),
+        "--map 'cal_dbm'=rss_db .or 'raw_dbfs'.$"),
     "a table in another encoding": ("time,h\udcf6he\n1,2\n", InputError, "another encoding than UTF-8"),
     "angles without positions": (
         table("time,roll,pitch,yaw", EPOCH + ",1.5,2.5,90"), InputError, "angles without positions"),

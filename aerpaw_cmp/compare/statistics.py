@@ -961,8 +961,9 @@ def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | 
     order = sorted(range(len(pairs)), key=lambda i: pairs[i].p_value)
     names = measured or range(len(pairs))
     out, tried = list(pairs), {names[i] for i in order if pairs[i].verdict != "no interval"}
+    several = len(tried) > 1  # one channel has the verdict of its interval, like the flight
     for place, i in enumerate(order):
-        if pairs[i].p_value * max(len(tried), 1) > _FAMILY:
+        if several and pairs[i].p_value * max(len(tried), 1) > _FAMILY:
             for rest in order[place:]:
                 if pairs[rest].verdict in ("better", "worse"):
                     out[rest] = replace(pairs[rest], verdict="not significant")

@@ -162,6 +162,7 @@ def test_verdicts_of_channels_are_corrected_for_their_number():
     none = dataclasses.replace(pair, p_value=1.0, verdict="no interval")
     words = [entry.verdict for entry in statistics.corrected([*pairs, none])]
     assert words == ["not significant", "better", "not significant", "better", "no interval"]
+    assert [entry.verdict for entry in statistics.corrected([pairs[2], none])] == ["better", "no interval"]
 
 
 def test_nineteen_samples_are_too_few_for_an_interval_and_twenty_are_not():

@@ -29,6 +29,7 @@ from .evidence import EPOCH, LEAST_BINS, MOST_FADING, PILE_DB, LevelEvidence, in
 from .health import Judged, Step, level_of, step_of
 from .noise import LEAST_VARIANCE, START, NoiseFit, NoiseParameters, fit_under_noise, shift_in_masks, squares_of_halves
 from .result import Cause
+from .statistics import is_flat
 
 # Prior and limit of the log odds: a fault occurs in one of ten flights, and is named if its odds are at least five to
 # one.
@@ -926,8 +927,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 def _limits(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a floor and a ceiling, or a constant level: an input without signal, or all levels beyond a limit."""
-    measured, predicted = (np.ptp(np.percentile(level, (10, 90))) for level in (e.measured_db, e.predicted_db))
-    if measured < _FLAT * predicted:
+    if is_flat(e.measured_db, [e.predicted_db]):
         yield Trial(
             name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
             sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} throughout",
@@ -941,8 +941,6 @@ def _limits(e: LevelEvidence) -> Iterator[Trial]:
         yield from _clipping(e, -1.0)
 
 
-# A level is flat if its central 80 % span less than this share of that of the predicted levels.
-_FLAT = 0.2
 # A limit allows a small share of samples beyond it, and the prediction must exceed it in a larger share [dB].
 _BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
 _FAR_DB, _LEAST_FAR = 3.0, 0.1

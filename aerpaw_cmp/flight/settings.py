@@ -340,7 +340,7 @@ class PlanSettings(StrictModel):
     fading_correlation_s: Positive = 2.0
     clock_shift_s: dict[str, float] = {}
     bad_lines: Annotated[int, Field(ge=0)] = 0
-    rank_k: Positive = 100.0
+    rank_k: Annotated[float, Field(ge=1.0)] = 100.0
     rank_error_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     no_csi_share: Annotated[float, Field(ge=0, le=1)] = 0.0
 

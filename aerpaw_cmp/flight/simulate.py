@@ -453,8 +453,8 @@ class FlightSimulator:
 
     def _with_bad_lines(self, data: bytes) -> tuple[bytes, list[str]]:
         """Insert ``plan.bad_lines`` broken lines at random positions, but not in the first line."""
-        count = self.plan.bad_lines
         lines = data.splitlines(keepends=True)
+        count = min(self.plan.bad_lines, len(lines) - 10)
         # a shorter log would consist mainly of broken lines
         if count == 0 or len(lines) < 20:
             return data, []

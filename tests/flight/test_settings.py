@@ -18,7 +18,7 @@ TINY = 1e-9
 # Numbers above 0, by their section of a flight file.
 POSITIVE = {
     "link.rss": "bandwidth_hz",
-    "flight.plan": "speed_mps climb_mps telemetry_interval_s rss_interval_s rank_interval_s fading_correlation_s rank_k",
+    "flight.plan": "speed_mps climb_mps telemetry_interval_s rss_interval_s rank_interval_s fading_correlation_s",
     "towers.N": "antenna_height_m",
     "rt.advanced": "gamma_db_per_m maximum_loss_db maximum_gap_s",
 }
@@ -33,6 +33,7 @@ LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     "logs.height_m": ([-1000, 20_000], [-1000.1, 20_000.1]),
     "flight.plan.waypoints": ([[POINT, POINT]], [[POINT]]),
     "flight.plan.bad_lines": ([0, 5], [-1]),
+    "flight.plan.rank_k": ([1.0], [1.0 - TINY]),
     "flight.plan.rank_error_share": ([0, 1], [-TINY, 1 + TINY]),
     "flight.plan.no_csi_share": ([0, 1], [-TINY, 1 + TINY]),
     "flight.name": (["a", "0_.-"], ["", "-a", ".a", "a b"]),
@@ -41,7 +42,7 @@ LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     "rt.advanced.samples": (["auto", 1, 100_000_000], [0, 100_000_001]),
     "rt.max_depth": ([0, 3], [-1, 4]),
     "rt.audit_links": ([0], [-1]),
-    "rss.advanced.lag_window_s": ([TINY, 3600], [0.0, 3600.1]),
+    "rss.advanced.lag_window_s": ([0.1, 3600], [0.1 - TINY, 3600.1]),
     "rss.span_db": ([[-1.0, 1.0], [0.0, 100_000.0]], [[1.0, 1.0], [2.0, 1.0], [0.0, 100_000.2]]),
     "rank.k": ([[1.001], [10.0] * 64], [[], [1.0], [10.0, 0.5], [10.0] * 65]),
     "trained_on": ([["a" * 64], []], [["a" * 63], ["g" * 64]]),

@@ -109,6 +109,7 @@ def test_torn_lines_stand_between_whole_ones_and_never_in_the_head(end: bytes) -
     assert all(any(line.decode().startswith(text[20:]) and len(text) == 28 for line in lines)
                for text in damage if text not in torn)  # fmt: skip
     assert simulator(bad_lines=6)._with_bad_lines(b"".join(lines[:19])) == (b"".join(lines[:19]), [])
+    assert len(simulator(bad_lines=500)._with_bad_lines(b"".join(lines))[1]) == len(lines) - 10
     assert simulator(bad_lines=0)._with_bad_lines(b"".join(lines)) == (b"".join(lines), [])
 
 

@@ -25,7 +25,7 @@ import json
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
@@ -1043,8 +1043,8 @@ class Pass:
 
     Parameters
     ----------
-    flight, link : str
-        Names. Passes of one link and of two flights are compared.
+    flight, tower, channel : str
+        Names. Passes of one tower and channel and of two flights are compared.
     position_m : ndarray, (n, 3)
         East, north, up. Rows with NaN have no partner.
     level_db, residual_db : ndarray, (n,)
@@ -1054,7 +1054,8 @@ class Pass:
     """
 
     flight: str
-    link: str
+    tower: str
+    channel: str
     position_m: FloatArray = field(repr=False)
     level_db: FloatArray = field(repr=False)
     residual_db: FloatArray = field(repr=False)
@@ -1063,31 +1064,39 @@ class Pass:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PassPair:
-    """A comparison of two passes of one link, whose indices are ``first`` and ``second``.
+    """The difference between two flights at the same positions, for one tower and channel.
 
     Parameters
     ----------
     n : int
-        Number of samples of the first pass with a partner.
+        Number of samples of the first flight with a partner.
+    share : float
+        ``n`` divided by the number of samples of the first flight.
     rmse_db, offset_db : float
-        Standard deviation and mean of second minus first, NaN without a pair.
+        Standard deviation and mean of second minus first measurement [dB], NaN without a pair.
     rmse_ci95_db : (low, high)
         95 % interval of the RMSE (:func:`spread_interval`), with correlation over time alone.
+    single_db : float
+        ``rmse_db / sqrt(2)``, the error of one flight if both have equal and independent errors.
     residual_rmse_db : float
-        Standard deviation of the difference of the residuals.
+        Standard deviation of the difference of the residuals [dB].
     place_rmse_db, place_correlation, height_difference_m : float
         Standard deviation and correlation of the mean residuals, and median difference of the mean heights, over common
-        cells.
+        horizontal cells. If the correlation is near 1, the model has the same errors on both flights.
     cells : int
         Number of common cells.
     """
 
-    first: int
-    second: int
+    tower: str
+    channel: str
+    first: str
+    second: str
     n: int
+    share: float
     rmse_db: float
-    offset_db: float
     rmse_ci95_db: Interval
+    offset_db: float
+    single_db: float
     residual_rmse_db: float
     place_rmse_db: float
     place_correlation: float
@@ -1148,38 +1157,37 @@ class _Prepared:
 
 def pass_pairs(
     passes: Sequence[Pass], *, cell_m: float, radius_m: float, heading_within_deg: float | None
-) -> Iterator[PassPair]:
-    """Yield every pair of two flights' passes on one link, by first flight, second flight and link.
+) -> list[PassPair]:
+    """Return every pair of two flights' passes on one link, in the order of the first and then of the second pass.
 
     Parameters
     ----------
     passes : sequence of Pass
+        At most one pass per flight, tower and channel.
     cell_m : float
         Side of the square cells on the map [m].
     radius_m : float
         A sample of the first pass is paired with the nearest sample of the second pass within this distance.
     heading_within_deg : float, optional
         Largest difference of the headings of a pair, if both passes have headings. None allows any heading.
-
-    Yields
-    ------
-    PassPair
     """
     places: dict[bytes, _Places] = {}
     # by flight, then by link
-    flights: dict[str, dict[str, list[_Prepared]]] = {}
+    flights: dict[str, dict[tuple[str, str], _Prepared]] = {}
     for number, flown in enumerate(passes):
         links = flights.setdefault(flown.flight, {})
-        links.setdefault(flown.link, []).append(_prepare(number, flown, cell_m, places))
+        links[flown.tower, flown.channel] = _prepare(number, flown, cell_m, places)
+    pairs: dict[tuple[int, int], PassPair] = {}
     for first, second in combinations(flights.values(), 2):
 
         @cache  # the links of a pair of flights share its searches
         def met(mine: _Places, theirs: _Places) -> tuple[IntArray, IntArray]:
             return mine.partners(theirs, radius_m, heading_within_deg)
 
-        for link, own in first.items():
-            for mine, theirs in product(own, second.get(link, ())):
-                yield _pair(mine, theirs, met)
+        for link in first.keys() & second.keys():
+            mine, theirs = first[link], second[link]
+            pairs[mine.number, theirs.number] = _pair(mine, theirs, met)
+    return [pairs[numbers] for numbers in sorted(pairs)]
 
 
 def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
@@ -1246,13 +1254,18 @@ def _pair(mine: _Prepared, theirs: _Prepared, met: Callable[[_Places, _Places], 
     residual = theirs.flown.residual_db[j] - mine.flown.residual_db[i]
     _, i, j = np.intersect1d(mine.cells, theirs.cells, assume_unique=True, return_indices=True)
     change, nan = theirs.means[j] - mine.means[i], float("nan")
+    rmse_db = float(level.std()) if len(level) else nan
     return PassPair(
-        first=mine.number,
-        second=theirs.number,
+        tower=mine.flown.tower,
+        channel=mine.flown.channel,
+        first=mine.flown.flight,
+        second=theirs.flown.flight,
         n=len(level),
-        rmse_db=float(level.std()) if len(level) else nan,
-        offset_db=float(level.mean()) if len(level) else nan,
+        share=len(level) / max(int(np.isfinite(mine.flown.level_db).sum()), 1),
+        rmse_db=rmse_db,
         rmse_ci95_db=spread_interval(level),
+        offset_db=float(level.mean()) if len(level) else nan,
+        single_db=rmse_db / 2.0**0.5,
         residual_rmse_db=float(residual.std()) if len(residual) else nan,
         place_rmse_db=float(change.std()) if len(i) else nan,
         place_correlation=correlation(mine.means[i], theirs.means[j]),

@@ -48,7 +48,6 @@ from ..report.campaign import (
     Failure,
     RankRow,
     RankTransfer,
-    Repeat,
     RssRow,
     SettingRank,
 )
@@ -539,7 +538,7 @@ def _flight_files(
 # --- numbers of several flights: repeatability, K chosen on the other flights ----------------------------------------
 
 
-def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
+def repeats(rows: Sequence[RssRow]) -> list[PassPair]:
     """Compare every pair of flights with a common tower and channel. ``rows`` are those of one setting."""
     passes = [
         Pass(
@@ -547,26 +546,14 @@ def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
             position_m=row.position_m,
             residual_db=row.residual_db,
             heading_deg=row.heading_deg,
-            link=f"{row.tower}\n{row.channel}",
+            tower=row.tower,
+            channel=row.channel,
             level_db=row.measured_db,
         )
         for row in rows
     ]
     rule = {"radius_m": CampaignData.radius_m, "heading_within_deg": CampaignData.heading_within_deg}
-    pairs = pass_pairs(passes, cell_m=CampaignData.cell_m, **rule)
-    known = [int(np.isfinite(row.measured_db).sum()) for row in rows]
-    ordered = sorted(pairs, key=lambda pair: (pair.first, pair.second))
-    return [_repeat(pair, rows[pair.first], rows[pair.second], known[pair.first]) for pair in ordered]
-
-
-def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat:
-    return Repeat(
-        tower=first.tower, channel=first.channel, first=first.flight, second=second.flight,
-        share=pair.n / max(known, 1), single_db=pair.rmse_db / 2.0**0.5,
-        n=pair.n, rmse_db=pair.rmse_db, rmse_ci95_db=pair.rmse_ci95_db, offset_db=pair.offset_db,
-        residual_rmse_db=pair.residual_rmse_db, place_rmse_db=pair.place_rmse_db,
-        place_correlation=pair.place_correlation, cells=pair.cells, height_difference_m=pair.height_difference_m,
-    )  # fmt: skip
+    return pass_pairs(passes, cell_m=CampaignData.cell_m, **rule)
 
 
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:

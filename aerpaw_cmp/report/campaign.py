@@ -17,7 +17,7 @@ from ..common.text import counted, guarded
 from ..common.units import FloatArray
 from ..compare.level import LEARNED_HERE
 from ..compare.offset import Moments, difference_moments
-from ..compare.statistics import Interval
+from ..compare.statistics import Interval, PassPair
 from ..compare.verdict import NodeOffset, Verdict, campaign_verdict, pooled_db
 from ..site.site import Site
 from .canvas import mark
@@ -151,48 +151,6 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Repeat:
-    """The difference between two flights at the same positions, for one tower and channel.
-
-    Parameters
-    ----------
-    rmse_db : float
-        RMS difference of the two measurements after the best constant ``offset_db`` (second minus first) [dB].
-    share : float
-        Number of pairs of samples divided by the number of samples of the first flight.
-    single_db : float
-        ``rmse_db / sqrt(2)``, the error of one flight if both have equal and independent errors.
-    residual_rmse_db : float
-        RMS difference of the residuals of the two flights [dB].
-    place_rmse_db : float
-        RMS difference of the mean residuals per horizontal cell, over all heights.
-    place_correlation : float
-        Correlation of the mean residuals per horizontal cell. If it is near 1, the model has the same errors on both
-        flights.
-    cells : int
-        Number of cells that both flights visit.
-    height_difference_m : float
-        Median height difference over these cells [m].
-    """
-
-    tower: str
-    channel: str
-    first: str
-    second: str
-    n: int
-    share: float
-    rmse_db: float
-    rmse_ci95_db: Interval | None
-    offset_db: float
-    single_db: float
-    residual_rmse_db: float
-    place_rmse_db: float
-    place_correlation: float
-    cells: int
-    height_difference_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RankTransfer:
     """The total variation of one flight with the K that other flights select.
 
@@ -292,7 +250,7 @@ class CampaignData(Made):
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()
     failures: tuple[Failure, ...] = ()
-    repeats: tuple[Repeat, ...] = ()
+    repeats: tuple[PassPair, ...] = ()
     rank_transfers: tuple[RankTransfer, ...] = ()
     site: Site | None = None
     synthetic: tuple[str, ...] = ()
@@ -694,7 +652,7 @@ def repeats_card(data: CampaignData) -> Card:
     """Return the card of pairs of flights at the same positions."""
     rmse = {row.key: row.rmse_db for row in data.reference_rows}
 
-    def errors(pair: Repeat) -> str:
+    def errors(pair: PassPair) -> str:
         return ", ".join(number(rmse.get((name, pair.tower, pair.channel))) for name in (pair.first, pair.second))
 
     pairs = Table(
@@ -705,7 +663,7 @@ def repeats_card(data: CampaignData) -> Card:
                  "Height difference": RIGHT},
         rows=[
             (f"{r.tower} {r.channel}", f"{r.first}, {r.second}", r.n, r.share, bold(number(r.rmse_db)),
-             r.rmse_ci95_db or "", r.single_db, r.residual_rmse_db, errors(r), r.place_rmse_db,
+             r.rmse_ci95_db, r.single_db, r.residual_rmse_db, errors(r), r.place_rmse_db,
              r.place_correlation, r.cells, number(r.height_difference_m, 0, "m"))
             for r in data.repeats[:ROWS_SHOWN]
         ],

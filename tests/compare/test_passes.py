@@ -33,7 +33,8 @@ def season(seed: int = 0) -> list[Pass]:
             passes.append(
                 Pass(
                     flight=f"f{flight}",
-                    link=f"l{link}",
+                    tower="T",
+                    channel=f"l{link}",
                     position_m=place,
                     level_db=level,
                     residual_db=residual,
@@ -72,17 +73,18 @@ def cells(flown: Pass) -> dict[tuple[int, int], tuple[float, float]]:
 def test_the_pairs_are_those_of_brute_force() -> None:
     """Numbers, not only counts: one wrong partner among the samples changes mean and deviation."""
     passes = season()
+    number = {(p.flight, p.channel): i for i, p in enumerate(passes)}
     by_passes = {
-        (p.first, p.second): p
+        (number[p.first, p.channel], number[p.second, p.channel]): p
         for p in pass_pairs(passes, cell_m=CELL_M, radius_m=RADIUS_M, heading_within_deg=WITHIN_DEG)
     }
     expected = [
         (i, j)
         for i, earlier in enumerate(passes)
         for j, later in enumerate(passes)
-        if i < j and earlier.link == later.link and earlier.flight != later.flight
+        if i < j and earlier.channel == later.channel and earlier.flight != later.flight
     ]
-    assert sorted(by_passes) == sorted(expected)
+    assert list(by_passes) == expected
     assert any(p.n == 0 for p in by_passes.values())
     assert sum(p.n > 50 for p in by_passes.values()) > 10
     for (i, j), pair in by_passes.items():
@@ -90,6 +92,7 @@ def test_the_pairs_are_those_of_brute_force() -> None:
         level = brute_force(earlier, later, earlier.level_db, later.level_db)
         residual = brute_force(earlier, later, earlier.residual_db, later.residual_db)
         assert pair.n == len(level)
+        assert pair.share == len(level) / np.isfinite(earlier.level_db).sum()
         if pair.n:
             assert (pair.rmse_db, pair.offset_db) == (level.std(), level.mean())
         if len(residual):

@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.compare.statistics import NO_INTERVAL, PassPair
 from aerpaw_cmp.compare.verdict import NodeOffset, Step
 from aerpaw_cmp.report import campaign as campaign_html
 from aerpaw_cmp.report import campaign as campaign_words
-from aerpaw_cmp.report.campaign import Repeat
 from benchmarks import fabricated
 
 
@@ -89,9 +89,9 @@ def many_pairs(count):
                "place_correlation": 0.5, "cells": 3, "height_difference_m": 0.0}  # fmt: skip
     for i in range(count):
         meets = i % 3 > 0
-        yield Repeat(
+        yield PassPair(
             tower=f"LW{i % 2 + 1}", channel="USRP1", first=f"flight {i}", second="other", n=i if meets else 0,
-            rmse_db=float(i * 7919 % 101) if meets else float("nan"), rmse_ci95_db=(1.0, 2.0) if meets else None, **nothing,
+            rmse_db=float(i * 7919 % 101) if meets else float("nan"), rmse_ci95_db=(1.0, 2.0) if meets else NO_INTERVAL, **nothing,
         )  # fmt: skip
 
 

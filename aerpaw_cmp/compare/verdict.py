@@ -533,13 +533,14 @@ _COVERED = 0.95
 class Coverage:
     """The coverage of a map at one height, as shares of its positions.
 
-    ``covered`` is the share with the trees as mapped, ``clear`` without trees (NaN if not mapped). ``outside`` is the
-    share that is farther from every flight than a correction reaches.
+    ``covered`` is the share with the trees as mapped, ``clear`` without trees (NaN if not mapped). ``reached`` is the
+    share with a path of any level, and ``outside`` the share farther from every flight than a correction reaches.
     """
 
     height_m: float
     covered: float
     clear: float = math.nan
+    reached: float = math.nan
     outside: float = 0.0
 
 
@@ -554,21 +555,22 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     -------
     Verdict
         Effect: the smallest covered share of all heights. Causes: ``extrapolated`` (most positions are outside the
-        flights), ``no path`` (no coverage), ``trees`` or ``blocked`` (the cause of most gaps), ``none`` (at least
-        :data:`_COVERED`). A computed share has no interval.
+        flights), ``no path`` (no coverage), ``trees``, ``weak`` (paths below the threshold) or ``blocked`` (the cause
+        of most gaps), ``none`` (at least :data:`_COVERED`). A computed share has no interval.
     """
     if not heights:
         return Verdict()
     worst = min(heights, key=lambda height: height.covered)
-    by_trees = max(float(np.nan_to_num(worst.clear - worst.covered)), 0.0)
+    gaps, by_trees = 1.0 - worst.covered, max(float(np.nan_to_num(worst.clear - worst.covered)), 0.0)
     if worst.outside > 0.5:
         cause = "extrapolated"
-    elif worst.covered == 0.0:
+    elif worst.covered == 0.0 and not worst.reached > 0.0:
         cause = "no path"
     elif worst.covered >= _COVERED:
         cause = NONE
     else:
-        cause = "trees" if by_trees >= 1.0 - worst.covered - by_trees else "blocked"
+        weak = worst.reached - worst.covered > gaps / 2.0
+        cause = "trees" if by_trees >= gaps / 2.0 else "weak" if weak else "blocked"
     return Verdict(cause=cause, effect=worst.covered, where=f"{worst.height_m:g} m")
 
 

@@ -310,7 +310,7 @@ def doubts(
         for hours, names in apart.items()
     ]
     if poseless:
-        texts.append(f"{max(poseless.values()):.0%} of the samples of {_listed(list(poseless))} have no position")
+        texts.append(f"{_listed(list(poseless))}: {100 * max(poseless.values()):.0f} % of the samples have no position")
     if undated:
         texts.append(f"{_listed(undated)} has no clock: by its positions it may belong to another flight on this route")
     low_m, assumed = _lowest_m(telemetry), telemetry.attributes.get("height_from") == "assumed"

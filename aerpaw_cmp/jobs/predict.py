@@ -42,7 +42,7 @@ from ..report.prediction import (
     memory_cautions,
     outside_share,
     prediction_metrics,
-    prior_caution,
+    prior_cautions,
     prior_words,
     write_prediction,
 )
@@ -69,6 +69,7 @@ from .sources import (
     memory_of,
     named_flights,
     outside,
+    outside_area,
     sources_of,
     target_files,
     track_m,
@@ -163,7 +164,7 @@ def predict(
             observed, about_logs = observe(known)
             sources = sources_of(known, observed)
             remarks += about_logs
-        _check_shared(where, sources, site, "the flights received" if known else "the site has learned")
+        _check_shared(where, sources, site, "the flights received" if known else "the site has")
         targets = find_targets(where, site, options, logs_root)
     work = f"{counted(len(targets.position_m), 'point')}: {', '.join(sources)}"
     stages.checked(lambda: [PlannedStage("choose, predict", work)])
@@ -211,7 +212,8 @@ def _model_fields(
     if isinstance(model, Prior):
         origin = prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
         verdict = first_words(None, 0.0, *expected, origin=origin)
-        return fields | {"verdict": verdict, "warnings": [prior_caution(PRIOR_SD_DB)]}
+        off = outside_area(table[["east_m", "north_m"]].to_numpy(np.float64), model.site).mean()
+        return fields | {"verdict": verdict, "warnings": prior_cautions(PRIOR_SD_DB, float(off))}
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return fields | {

@@ -312,8 +312,8 @@ def _checked(frame: pd.DataFrame, data: FlightData) -> tuple[str, pd.DataFrame]:
     if len(set(names)) < len(names) or len(quantities) > 1:
         raise InputError(f"several columns of one quantity {columns}", expected="one of them")
     if not quantities and not {"rank", *RANKS} & set(names):
-        near = [name for name in names if name in ("level", "rss", "rsrp", "rssi", "power", "path_gain")]
-        cause = f"the unit of {near[0]!r} is not in its name" if near else None
+        near = [name for name in names if name.split("_")[0] in ("level", "rss", "rsrp", "rssi", "power", "path")]
+        cause = f"{near[0]!r} has another unit, or no unit in its name" if near else None
         raise InputError(
             f"no column of a level with its unit {columns}",
             expected="level_dbm, level_db (the unit of the log) or path_loss_db",
@@ -422,8 +422,9 @@ def _check_repeats(table: pd.DataFrame) -> None:
     if len(twice):
         first = twice[key].iloc[0].drop("channel").dropna()
         where = ", ".join(f"{name} {f'{v:.2f}' if isinstance(v, float) else v}" for name, v in first.items())
+        one = "time" if "time" in key else "position"
         raise InputError(
-            f"{counted(len(twice), 'row')} with several levels at one position: {where}",
+            f"{counted(len(twice), 'row')} with several levels at one {one}: {where}",
             expected="one row per tower, channel and time or position",
             cause="two channels or two heights without their column",
         )

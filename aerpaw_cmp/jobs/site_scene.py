@@ -148,7 +148,7 @@ def _origin(text: str | None, base: SiteModel | None) -> dict[str, Any]:
         origin: dict[str, Any] = {"latitude_deg": values[0], "longitude_deg": values[1]}
         if not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
             raise UsageError(
-                f"--origin '{text}'", expected="latitude,longitude in degrees", cause="the two are swapped"
+                f"--origin '{text}'", expected="latitude,longitude in degrees", cause="longitude before latitude"
             )
         if len(values) == 3:
             origin["ground"] = {"height_m": values[2], "reference": "orthometric"}

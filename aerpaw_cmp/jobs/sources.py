@@ -340,7 +340,7 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
         leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(position) - 1)
         position = interpolated(at, along, position)
         yaw, time = yaw[leg], at / SPEED_MPS
-        remarks += (f"Points every {STEP_M:g} m; times by a speed of {SPEED_MPS:g} m/s.",)
+        remarks += (f"The points are {STEP_M:g} m apart, and the times assume a speed of {SPEED_MPS:g} m/s.",)
     up = _leaning(position, time)
     return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, up=up, remarks=remarks)
 
@@ -545,10 +545,7 @@ class Memory:
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
         level, spread, gain_variance = memory.level, memory.spread, (sds**2).mean(axis=0)
         variance_db2 = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
-        west, east, south, north = self._site.area_m
-        off = np.any(np.abs(each[0].position_m[:, :2] - (0.5 * (west + east), 0.5 * (south + north)))
-                     > (0.5 * (east - west), 0.5 * (north - south)), axis=1)  # fmt: skip
-        guess = off | (gain_variance > 0.5 * memory.prior_variance_db2)
+        guess = outside_area(each[0].position_m, self._site) | (gain_variance > 0.5 * memory.prior_variance_db2)
         return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + variance_db2), guess
 
     def fading(self, antenna: str) -> Spread:
@@ -630,6 +627,13 @@ class Prior:
     def fading(self, _antenna: str) -> Spread:
         """Return the spread of samples about their means over 4 s."""
         return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_SD_DB["fading"])
+
+
+def outside_area(position_m: FloatArray, site: Site) -> BoolArray:
+    """Return true for positions (n, 2 or more) outside the area of the site."""
+    west, east, south, north = site.area_m
+    easting, northing = position_m[:, 0], position_m[:, 1]
+    return (easting < west) | (easting > east) | (northing < south) | (northing > north)
 
 
 def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:

@@ -559,7 +559,7 @@ class LinkBudget:
         level_dbm, noise_dbm = self.threshold_dbm, self.noise_dbm
         if level_dbm is not None and noise_dbm is not None and level_dbm < round(noise_dbm, 1):
             raise UsageError(
-                f"a threshold of {level_dbm:g} dBm below the noise floor of {noise_dbm:.1f} dBm",
+                f"a threshold of {level_dbm:g} dBm, below the noise floor of {noise_dbm:.1f} dBm",
                 expected="a level above the noise, or threshold_snr_db (--threshold-snr-db) with a negative SNR",
                 cause="a threshold that is valid for a narrower band",
             )

@@ -230,20 +230,20 @@ def _groups(data: CalibrationData) -> Iterator[Places]:
 
 def scores_card(data: CalibrationData) -> Card:
     """Return the card of held-out errors, by what was held out and by flight and channel."""
-    each = {"as logged": 2, "4 s means": 2}
-    baselines = dict.fromkeys(BASELINES.values(), 2)
+    each = {"as logged": 1, "4 s means": 1}
+    baselines = dict.fromkeys(BASELINES.values(), 1)
     rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
     keys = ("rmse_db", "rmse_4s_db", *BASELINES)
     means = Table(
         caption="RMSE in dB after one offset per flight and channel, mean over flights and channels; a dash: it could "
         "not be held out.",
-        columns={"Held out": HEAD, **each, **baselines, "series": 0},
+        columns={"Held out": HEAD, **each, **baselines, "channels": 0},
         rows=[(SPLIT_TITLE.get(name, name), *(_mean(of, key) for key in keys), len(of)) for name, of in rows.items()],
     )  # fmt: skip
     every = Table(
         caption="RMSE in dB after the flight's own offset; \"offset of the training flights\": with their mean offset.",
         columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "Channel": TEXT, **each,
-                 "offset of the training flights": 2, **baselines, "samples": 0},
+                 "offset of the training flights": 1, **baselines, "samples": 0},
         rows=_rows(data.scores, ("flight", "tower", "channel", "rmse_db", "rmse_4s_db", "rmse_shared_offset_db",
                                  *BASELINES, "n")),
     )  # fmt: skip

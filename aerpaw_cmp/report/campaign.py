@@ -728,7 +728,7 @@ def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
     code = Markup("<code>{}: {}</code>")
     table = Table(
         caption="Changes of the flight files in each setting.", columns={"Setting": HEAD, "Changes": TEXT},
-        rows=[(name, Markup(", ").join(code.format(*entry) for entry in change.items()) or "nothing")
+        rows=[(name, Markup(", ").join(code.format(*entry) for entry in change.items()) or "no changes")
               for name, change in data.settings.items()],
     )  # fmt: skip
     method = "Method: D. Lee, O. Ozdemir, A. Ram, I. Guvenc, arXiv 2502.10324."

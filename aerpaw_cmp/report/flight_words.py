@@ -188,7 +188,7 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
     word = "equal" if near else paired_verdict(*verdict.ci95_db)
     ends = sorted(map(abs, verdict.ci95_db)) if word in ("better", "worse") else verdict.ci95_db
     name, over = with_article(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
-    floor = "" if floor_db is None else f", floor {Printed(floor_db):.0f}"
+    floor = "" if floor_db is None else f", floor {Printed(floor_db):.0f} dB"
     signs = "+" if word == "not significant" else ""
     return _DECIDED[word].format(
         ray=f"{verdict.rmse_db:.1f} dB{floor}", other=f"{verdict.baseline_rmse_db:.1f} dB", over=over,
@@ -634,7 +634,7 @@ def _audit(audit: AuditResult) -> Headline:
 def _error(panels: Sequence[RssResult], pooled: FlightVerdict | None) -> Headline:
     total = _pooled(panels) if pooled is None else pooled.rmse_db
     best = "no baseline" if pooled is None else f"{pretty(pooled.against)}: {pooled.baseline_rmse_db:.1f} dB"
-    floor = ", lower levels as the floor" if any(map(lock_lost, panels)) else ""
+    floor = ", clipped at the floor" if any(map(lock_lost, panels)) else ""
     channels = f", {len(panels)} channels" if len(panels) > 1 else ""
     return Headline(
         label=f"RMSE of the level{channels}{floor}", value=f"{total:.1f} dB",

@@ -40,14 +40,14 @@ def write_locate(
     places = Places(
         name="region of the node",
         at=np.column_stack([east[inside], north[inside], np.zeros(inside.sum())]),
-        values={"in the region of [%]": 100.0 * held[inside]},
+        values={"smallest region with this position [%]": 100.0 * held[inside]},
         cell_m=float(regions.east_m[1] - regions.east_m[0]),
     )
     crosses = [np.array([[m["east_m"], m["north_m"]]]) + 8.0 * arm for m in numbers["modes"] for arm in _CROSS]
     shown = payload([places], site, lines=[track_m, *crosses])
     table = Table(
-        caption="Parts of the 90 % region. Nine tenths of a part are within the stated distance of its place",
-        columns={"Place": HEAD, "East [m]": 0, "North [m]": 0, "Share": SHARE, "Within [m]": 0},
+        caption="Parts of the 90 % region. Nine tenths of a part are within the stated distance of its position.",
+        columns={"Position": HEAD, "East [m]": 0, "North [m]": 0, "Share": SHARE, "Within [m]": 0},
         rows=[(f"{m['latitude_deg']:.7f}, {m['longitude_deg']:.7f}", m["east_m"], m["north_m"], m["share"],
                m["radius_m"])
               for m in numbers["modes"]],
@@ -56,7 +56,7 @@ def write_locate(
         kind="locate", title=f"Ground node of {numbers['flight']}, {numbers['channel']}", verdict=numbers["sentence"],
         cautions=numbers["warnings"], about=[f"Made {minute(numbers['generated'])}."],
         cards=[Card(title="Map", positions=Positions(view="places", data=shown)),
-               Card(title="Region", id="places", tables=[table]),
+               *[Card(title="Regions", id="places", tables=[table])] * (len(numbers["modes"]) > 1),
                Card(title="Assumptions", id="assumed", text=[numbers["assumed"]])],
     )  # fmt: skip
     return write_page(folder, "locate", page, numbers)

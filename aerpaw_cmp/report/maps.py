@@ -158,6 +158,10 @@ LEAST = "Lowest coverage: {percent:.1f} % of the positions at {where}"
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
     "trees": (LEAST + "; trees cause most of the gaps.", "fly higher, or {thinner}"),
+    "weak": (
+        LEAST + "; in most of the gaps there is a path, but its level is below the threshold.",
+        "compare with one element (Antennas: SISO), because the beam of the array has nulls",
+    ),
     "blocked": (LEAST + "; buildings and terrain cause most of the gaps.", "fly higher, or add a tower"),
     "no path": ("There is no path to any position at {where}.", "check the towers and the area of the site"),
     "extrapolated": (
@@ -194,7 +198,13 @@ def coverage(data: MapsData) -> list[Coverage]:
     clear = {item.height_m: item.coverage for item in same_link if item.foliage == "none" != first.foliage}
     outside = data.outside_flown
     return [
-        Coverage(height_m=m.height_m, covered=m.coverage, clear=clear.get(m.height_m, np.nan), outside=outside)
+        Coverage(
+            height_m=m.height_m,
+            covered=m.coverage,
+            clear=clear.get(m.height_m, np.nan),
+            reached=float(np.isfinite(m.values).mean()),
+            outside=outside,
+        )
         for m in same_link
         if m.foliage == first.foliage
     ]

@@ -88,7 +88,7 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
         known = "No flight is known: antennas are those that the model assumes."
     return Page(
         kind="plan", title=f"Next flight for {target}", verdict=data.sentence, cautions=data.warnings,
-        about=[f"{known} Antennas: {', '.join(data.antennas)}. Made {minute(data.generated)}. "
+        about=[f"{known} Channels: {', '.join(data.antennas)}. Made {minute(data.generated)}. "
                "QGroundControl opens route.plan; route.csv has the same waypoints."],
         cards=[Card(title="Target and route", positions=Positions(view="places", data=shown)),
                Card(title="Candidates", id="candidates", tables=[candidates]),

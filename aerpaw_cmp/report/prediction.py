@@ -85,6 +85,7 @@ LOCK = "The receiver is in lock for {percent:.0f} % of them (P(lock) of each poi
 REMEMBERED = "No flight is named: antennas and levels are those learned at this site."
 OUTSIDE = {
     "flown": "{percent:.0f} % of the points are outside the flown area.",
+    "site": "{percent:.0f} % of the points are outside the area of the site (`area_m`), where the map may end.",
     "remembered": "{percent:.0f} % of the points are in directions that few training samples have.",
 }
 PLAN = "Next: `aerpaw-cmp plan` finds the flight that reduces the standard deviation most."
@@ -178,10 +179,17 @@ def prior_words(carrier_hz: float, power_dbm: float) -> str:
     )
 
 
-def prior_caution(sd_db: Mapping[str, float]) -> str:
-    """Return the sentence about the parts of the standard deviation before any flight [dB]."""
+def prior_cautions(sd_db: Mapping[str, float], beyond: float) -> list[str]:
+    """Return warnings for a prediction before any flight.
+
+    ``sd_db`` contains the parts of the standard deviation [dB]. ``beyond`` is the share of points outside the site.
+    """
     parts = ", ".join(f"{name} {value:g} dB" for name, value in sd_db.items())
-    return f"The standard deviation is a prior: {parts}. One flight determines the offset and most of the rest."
+    texts = filled([OUTSIDE["site"]], percent=100.0 * beyond) if beyond else []
+    return [
+        *texts,
+        f"The standard deviation is a prior: {parts}. One flight determines the offset and most of the rest.",
+    ]
 
 
 def _stated(correction: Correction) -> str:

@@ -796,7 +796,7 @@ def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:
         latitude, longitude, height = numbers_of(place, (3,), f"--tower {name}", f"--tower {form}")
         for wrong, cause in (
             (not 0 < height <= TALLEST_M, f"a height outside 0 to {TALLEST_M:g} m"),
-            (not (abs(latitude) <= 90 and abs(longitude) <= 180), "the two are swapped, or not in degrees"),
+            (not (abs(latitude) <= 90 and abs(longitude) <= 180), "longitude before latitude, or not in degrees"),
             (name in by_name, f"two towers named '{name}'"),
         ):
             if wrong:

@@ -105,7 +105,7 @@ class MapFile:
         """Add a note about elements of a file ``name`` that do not enclose an area, counted by kind."""
         if lines:
             listed = ", ".join(f"{count} {what}" for what, count in lines.most_common())
-            self.notes.append(f"{name}: left out, not areas: {listed}")
+            self.notes.append(f"{name}: skipped, because they are not areas: {listed}")
 
 
 # A ring with more self-intersections than this is not repaired, because the repair could take unlimited time.

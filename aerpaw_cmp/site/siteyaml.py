@@ -904,7 +904,7 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
             raise UsageError(
                 f"'{name}': latitude {latitude:g}, longitude {longitude:g}",
                 expected="latitude, longitude in degrees",
-                cause="the two are swapped" if abs(latitude) <= 180 and abs(longitude) <= 90 else None,
+                cause="latitude and longitude are swapped" if abs(latitude) <= 180 and abs(longitude) <= 90 else None,
             )
     latitude, longitude = np.array(ring).T
     east, north = frame.to_local(latitude, longitude)

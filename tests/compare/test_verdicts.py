@@ -232,14 +232,16 @@ def test_stated_errors_by_their_limits(
 
 
 @pytest.mark.parametrize(
-    ("covered", "clear", "outside", "cause"),
-    [(0.95, 1.0, 0.0, "none"), (0.94, 1.0, 0.0, "trees"), (0.5, 0.6, 0.0, "blocked"), (0.0, 0.0, 0.0, "no path"),
-     (0.9, 1.0, 0.51, "extrapolated"), (0.99, 1.0, 0.5, "none"), (0.5, np.nan, 0.0, "blocked")],
+    ("covered", "clear", "reached", "outside", "cause"),
+    [(0.95, 1.0, 1.0, 0.0, "none"), (0.94, 1.0, 1.0, 0.0, "trees"), (0.5, 0.6, 0.5, 0.0, "blocked"),
+     (0.0, 0.0, 0.0, 0.0, "no path"), (0.9, 1.0, 1.0, 0.51, "extrapolated"), (0.99, 1.0, 1.0, 0.5, "none"),
+     (0.5, np.nan, np.nan, 0.0, "blocked"), (0.5, 0.6, 0.9, 0.0, "weak"), (0.5, 0.6, 0.7, 0.0, "blocked"),
+     (0.0, 0.0, 0.3, 0.0, "blocked"), (0.0, 0.0, 1.0, 0.0, "weak")],
 )  # fmt: skip
 def test_the_worst_height_says_what_takes_its_coverage(
-    covered: float, clear: float, outside: float, cause: str
+    covered: float, clear: float, reached: float, outside: float, cause: str
 ) -> None:
-    here = Coverage(height_m=70.0, covered=covered, clear=clear, outside=outside)
+    here = Coverage(height_m=70.0, covered=covered, clear=clear, reached=reached, outside=outside)
     said = coverage_verdict([Coverage(height_m=30.0, covered=1.0, outside=1.0), here])
     assert (said.cause, said.effect, said.where) == (cause, covered, "70 m")
 

@@ -127,7 +127,7 @@ def test_samples_before_the_clock_was_set_are_named(case: Path) -> None:
 def test_clauses_on_clocks_reach_the_first_words(case: Path) -> None:
     rewrite(case / "T1_power_log.txt", "1970-01-01", "2025-06-01")  # 60 samples hours before the telemetry
     data = loaded(case)
-    assert any("30% of the samples of RSS of T1 U have no position" in text for text in data.doubts)
+    assert any("RSS of T1 U: 30 % of the samples have no position" in text for text in data.doubts)
     assert set(data.doubts) <= {text.rstrip(".") for text in data.warnings}
 
 

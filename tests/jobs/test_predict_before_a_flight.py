@@ -50,6 +50,12 @@ def test_level_is_that_of_two_paths_and_the_standard_deviation_is_stated(place: 
     assert "Outside flown area" not in (place / "out" / "prediction.html").read_text(encoding="utf-8")
 
 
+def test_points_outside_the_area_of_the_site_are_counted(place: Path) -> None:
+    assert not any("outside the area" in text for text in predicted(place)[1]["warnings"])
+    (place / "points.csv").write_text(POINTS + "9000,0,60\n")
+    assert "25 % of the points are outside the area of the site" in predicted(place)[1]["warnings"][0]
+
+
 def test_options_replace_carrier_and_power_of_the_site(place: Path) -> None:
     level = predicted(place)[0]["level_db"].to_numpy()
     changed = predicted(place, "--tx-power-dbm", "20", "--carrier-ghz", "2.5")[0]["level_db"].to_numpy()

@@ -209,11 +209,12 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
     ("change", "words"),
     [
         (lambda f: f.assign(tower="BS1"), "towers BS1; expected towers of the flight: LW1"),
-        (lambda f: f.rename(columns={"level_dbm": "rss"}), "the unit of 'rss' is not in its name"),
+        (lambda f: f.rename(columns={"level_dbm": "rss"}), "'rss' has another unit, or no unit in its name"),
+        (lambda f: f.rename(columns={"level_dbm": "level_w"}), "'level_w' has another unit, or no unit in its name"),
         (lambda f: f.assign(level_dbm=10 ** (f["level_dbm"] / 10)), "watts or milliwatts"),
         (lambda f: f.assign(time_utc=f["time_utc"].str.replace("T14", "T18")), "another time zone, +4 h"),
         (lambda f: f.rename(columns={"time_utc": "time"}).assign(time="2025-06-01 14:00:00"), "times without a zone"),
-        (lambda f: pd.concat([f, f.assign(level_dbm=-50.0)]), "with several levels at one position"),
+        (lambda f: pd.concat([f, f.assign(level_dbm=-50.0)]), "with several levels at one time"),
         (lambda f: f.drop(columns="tower"), "no column tower"),
         (lambda f: f.drop(columns="time_utc"), "without a time and without a position"),
         (

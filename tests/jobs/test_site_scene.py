@@ -69,7 +69,7 @@ def test_what_a_scene_does_not_say_is_asked_for(room: Path, tmp_path: Path) -> N
         run_scene_import(room, out, SceneOptions())
     with pytest.raises(UsageError, match=r"has no towers.*from -50 to 50 m east"):
         run_scene_import(room, out, SceneOptions(origin="local"))
-    with pytest.raises(UsageError, match="the two are swapped"):
+    with pytest.raises(UsageError, match="longitude before latitude"):
         run_scene_import(room, out, SceneOptions(origin="-118.7,35.7"))
     with pytest.raises(UsageError, match="--tower A"):
         run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2"]))

@@ -454,7 +454,7 @@ def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_
     assert pooled.difference_db == pytest.approx(expected[0] - expected[1])
     data = dataclasses.replace(report_data, rss=(panel,), verdict=pooled)
     text, cards = paragraph(data), headlines(data)
-    assert text.startswith(f"Ray tracing (RMSE {expected[0]:.1f} dB, floor −{abs(floor):.0f}) is ")
+    assert text.startswith(f"Ray tracing (RMSE {expected[0]:.1f} dB, floor −{abs(floor):.0f} dB) is ")
     assert text.count("RMSE") == 1
     assert "Expect 8.2 dB on another flight." in text
     assert "Brier" not in text

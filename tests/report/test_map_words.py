@@ -36,11 +36,23 @@ def test_the_cause_that_was_put_in_is_said(
     maps_data: MapsData, covered: dict[str, float], change: dict[str, Any], said: str
 ) -> None:
     level = np.zeros((len(maps_data.north_m), len(maps_data.east_m)))
-    joint = {"tower": "joint", "antennas": "MIMO", "height_m": 30.0, "values": level}
-    rss = tuple(RssMap(**joint, coverage=share, foliage=mode) for mode, share in covered.items())
+    joint = {"tower": "joint", "antennas": "MIMO", "height_m": 30.0}
+    count = np.arange(level.size).reshape(level.shape)
+    rss = tuple(
+        RssMap(**joint, coverage=share, foliage=mode, values=np.where(count < share * level.size, level, np.nan))
+        for mode, share in covered.items()
+    )
     text = first_words(dataclasses.replace(maps_data, rss=rss, **change)).replace("\N{MINUS SIGN}", "-")
     assert said in text
     assert "Best height" not in text  # one height has no best
+
+
+def test_gaps_with_a_path_below_the_threshold_are_not_blamed_on_buildings(maps_data: MapsData) -> None:
+    level = np.zeros((len(maps_data.north_m), len(maps_data.east_m)))
+    weak = RssMap(tower="joint", antennas="MIMO", height_m=30.0, coverage=0.6, foliage="none", values=level)
+    text = first_words(dataclasses.replace(maps_data, rss=(weak,)))
+    assert "there is a path, but its level is below the threshold" in text
+    assert text.endswith("Next: compare with one element (Antennas: SISO), because the beam of the array has nulls.")
 
 
 def test_several_heights_name_the_best_and_the_worst(maps_data: MapsData) -> None:

@@ -205,7 +205,7 @@ def test_what_is_no_area_is_counted(tmp_path: Path) -> None:
     line = feature({"type": "LineString", "coordinates": square(0, 0)}, building="yes")
     footprints = read(tmp_path, collection(feature(polygon(square(0, 0)), **BARN), feature(None, **BARN), line, line))
     assert len(footprints.buildings) == 1
-    assert said(footprints, "left out, not areas: 2 LineString, 1 without geometry")
+    assert said(footprints, "skipped, because they are not areas: 2 LineString, 1 without geometry")
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def test_towers_replace_those_of_a_base(tmp_path: Path) -> None:
     [
         ("roof", "expected --tower NAME=LATITUDE,LONGITUDE,HEIGHT"),
         ("roof=1,2", "expected --tower NAME=LATITUDE,LONGITUDE,HEIGHT"),
-        ("roof=151.2,-33.86,25", "the two are swapped"),
+        ("roof=151.2,-33.86,25", "longitude before latitude"),
         ("roof=-33.86,151.2,25000", "a height outside"),
         ("roof=-33.86,151.2,nan", "a height outside"),
     ],

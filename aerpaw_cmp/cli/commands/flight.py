@@ -91,7 +91,7 @@ def _print_cards(verdict: Mapping[str, Any]) -> None:
     }  # fmt: skip
     title = f"{verdict['prediction']} and other models on the same samples, means over channels (each in card.json)"
     records(verdict["means"], columns, title)
-    columns = {"series": "series", "offset dB": "offset_db:.1f", "slope": "slope:.2f", "floor dB": "floor_db:.1f"}
+    columns = {"channel": "series", "offset dB": "offset_db:.1f", "slope": "slope:.2f", "floor dB": "floor_db:.1f"}
     title = "Offset (added to the measurement), slope of measured over predicted level, detection floor"
     records(verdict["nodes"], columns, title)
     for remark in verdict["remarks"]:
@@ -226,9 +226,9 @@ def calibrate(
         means = [sum(s[key] for s in scores) / len(scores) if scores else None
                  for key in ("rmse_db", "rmse_4s_db", *BASELINES)]  # fmt: skip
         kind = name.removesuffix("_left_out").replace("_", " ")
-        rows.append([kind, *(number(v, "{:.2f}") for v in means), str(len(scores))])
+        rows.append([kind, *(number(v, "{:.1f}") for v in means), str(len(scores))])
     if rows:
-        heads = ["held out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
+        heads = ["held out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "channels"]
         table(heads, rows, "Mean scores on held-out data")
     forecasts = [f | {"split": split.removesuffix("_left_out")} for split, scores in m["rank"].items() for f in scores]
     columns = {

@@ -79,8 +79,8 @@ def _print_prediction(outcome: Any) -> None:
     show(m["sentence"])
     series = [{"name": name, **numbers} for name, numbers in m["series"].items()]
     columns = {
-        "series": "name", "unit": "unit", "mean level": "mean_level_db:.1f", "mean SD dB": "mean_sd_db:.1f",
-        "outside flown": "share_outside_flown:.0%", "points": "points",
+        "channel": "name", "unit": "unit", "mean level": "mean_level_db:.1f", "mean SD dB": "mean_sd_db:.1f",
+        **({"outside flown area": "share_outside_flown:.0%"} if m["flights"] else {}), "points": "points",
     }  # fmt: skip
     records(series, columns, "Prediction")
     warn_all(m["warnings"])

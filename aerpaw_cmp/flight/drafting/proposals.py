@@ -827,7 +827,7 @@ def _in_band(item: LearnedLink, series: RssSeries, band: float) -> bool:
     return abs(series.link.carrier_hz / item.series.carrier_hz - 1.0) <= band
 
 
-# Larger odds are shown as "more than".
+# Larger odds are shown as "more than", and smaller odds than its inverse as "less than".
 _MOST_ODDS = 1000.0
 
 
@@ -844,10 +844,16 @@ def _odds(odds: Evidence) -> str:
 
 
 def _ratio(nat: float) -> str:
-    """Return log odds [nat] as a ratio such as ``55:1``."""
-    if nat > math.log(_MOST_ODDS):
-        return f"more than {_MOST_ODDS:.0f}:1"
-    return f"{math.exp(nat):.0f}:1" if nat > 0.0 else f"1:{math.exp(min(-nat, 20.0)):.0f}"
+    """Return log odds [nat] as a ratio.
+
+    Examples
+    --------
+    >>> _ratio(4.0), _ratio(20.0), _ratio(-1.0), _ratio(-20.0)
+    ('55:1', 'more than 1000:1', '1:3', 'less than 1:1000')
+    """
+    for_one = math.exp(min(abs(nat), math.log(_MOST_ODDS)))
+    beyond = "" if abs(nat) <= math.log(_MOST_ODDS) else "more than " if nat > 0.0 else "less than "
+    return beyond + (f"{for_one:.0f}:1" if nat > 0.0 else f"1:{for_one:.0f}")
 
 
 # Assumptions about the scatter of the levels of a node at an unknown place, with an unknown gain of the airframe.

@@ -5,6 +5,7 @@ const common = (() => {
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   // a number that rounds to zero has no sign
   const number = (v, digits = 1, unit = "") => Number.isFinite(v) ? (+v.toFixed(digits) === 0 ? 0 : v).toFixed(digits).replace("-", "−") + (unit ? " " + unit : "") : "–";
+  const count = n => String(n).replace(/\B(?=(\d{3})+$)/g, "\u202f");
   const FONT = "12px system-ui, sans-serif";
 
   // one deflated block in base64 that contains all arrays, each at a multiple of eight bytes
@@ -307,5 +308,5 @@ const common = (() => {
     for (const place of document.querySelectorAll("canvas[data-plot]")) whenResized(place, () => drawPlot(place));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, downloads, saves, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar, plots };
+  return { at, css, number, count, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, downloads, saves, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar, plots };
 })();

@@ -4,7 +4,7 @@
 (async () => {
   const data = JSON.parse(document.getElementById("explorer-data").textContent);
   const root = document.getElementById("explorer");
-  const { at, css, number, cells, fill, axes, later, shade } = common;
+  const { at, css, number, count, cells, fill, axes, later, shade } = common;
 
   const arrays = await common.unpack(data.packed), get = i => i === undefined || i === null ? null : arrays[i];
 
@@ -111,15 +111,15 @@
     const span = state.span ? `${clock(state.span[0])} to ${clock(state.span[1])}` : "whole flight";
     rows.push(["Span", span]);
     if (s) {
-      rows.push(["Samples", number(s.n, 0)]);
+      rows.push(["Samples", count(s.n)]);
       if (rss().models[state.model].learned_here) rows.push(["RMSE", "not scored: antennas learned from this flight"]);
       else if (s.n) rows.push(["RMSE, offset refitted on the selection", number(s.rmse, 1, "dB")], ["Offset of the selection", number(s.offset, 1, "dB")],
         ["RMSE with the flight's offset", number(s.rmseFlight, 1, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
     }
-    if (r) rows.push(["Rank reports", number(r.n, 0)], ["Agreement", number(100 * r.agreement, 0, "%")]);
+    if (r) rows.push(["Rank reports", count(r.n)], ["Agreement", number(100 * r.agreement, 0, "%")]);
     cells(at("span"), rows);
     const shown = rss(), held = shown ? get(shown.time).length : 0;
-    at("thinned").textContent = shown && held < shown.of ? `${held} of ${shown.of} samples are in this page (extremes are retained); rss.csv and rank.csv contain all.` : "";
+    at("thinned").textContent = shown && held < shown.of ? `${count(held)} of ${count(shown.of)} samples are in this page (extremes are retained); rss.csv and rank.csv contain all.` : "";
   }
 
   // --- charts over time -----------------------------------------------------------------------------------------------

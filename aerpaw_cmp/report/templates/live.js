@@ -255,8 +255,8 @@
     const m = modem.rows.columns, c = modem.predictions.columns, ink = css("--predicted"), blue = css("--measured"), grey = css("--interval"), red = css("--accent");
     const half = values => values.map(v => v - 0.25), more = values => values.map(v => v + 0.25), given = modem.now.inside;
     const known = c.t.length > 0;
-    at("rank-words").textContent = known ? `dots measured, line predicted; 90 % interval holds ${share(given?.slice(0, 2) ?? [0, 0])}` : "dots measured";
-    at("rsrp-words").textContent = known ? `dots measured, line predicted plus offset; 90 % interval holds ${share(given?.slice(2) ?? [0, 0])}` : "dots measured";
+    at("rank-words").textContent = known ? `dots measured, line predicted; inside the 90 % interval: ${share(given?.slice(0, 2) ?? [0, 0])}` : "dots measured";
+    at("rsrp-words").textContent = known ? `dots measured, line predicted plus offset; inside the 90 % interval: ${share(given?.slice(2) ?? [0, 0])}` : "dots measured";
     const [from, to] = range(), part = list => { const [a, b] = within(c.t, from, to); return list.slice(a, b); }, ct = part(c.t);
     chart("chart-rank", [band(ct, half(part(c.low)), more(part(c.high)), grey, true), line(ct, part(c.predicted), ink, 2, true), dots(m.t, m.rank, blue, 5)], { low: 0.5, high: 4.5, label: "", marks: [1, 2, 3, 4] });
     const [low, high] = extent([[m.t, m.rsrp], [c.t, c.level]], 20);

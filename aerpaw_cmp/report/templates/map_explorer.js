@@ -1,7 +1,7 @@
 "use strict";
 // The linked map: one layer or the difference of two, values at the pointer, a profile, and numbers of the layer.
 (async () => {
-  const { at, css, number, cells, fill, frame, axes, ramp, quantile, later, whenResized } = common;
+  const { at, css, number, count, cells, fill, frame, axes, ramp, quantile, later, whenResized } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
   const east = arrays[data.east], north = arrays[data.north], columns = east.length, rows = north.length;
   const ramps = { level: ramp("viridis"), difference: ramp("RdBu_r") };
@@ -202,7 +202,7 @@
     if (none) out.push(["Layer", `there is no layer ${none} for these choices`]);
     else if (s.share) s.share.forEach((share, i) => out.push([q.classes[0] === "Z" ? (i ? `Rank ${q.classes[i]}` : "No path") : q.classes[i], percent(share)]));
     else {
-      out.push([state.difference ? "Cells with both" : "Cells with a value", `${percent(s.covered)} of ${s.cells} cells`]);
+      out.push([state.difference ? "Cells with both" : "Cells with a value", `${percent(s.covered)} of ${count(s.cells)} cells`]);
       if (s.n) out.push(["Median", words(s.median, 1)], ["Mean", q.kind === "classes" ? number(s.mean, 2) : words(s.mean, 1)], ["10th / 90th percentile", `${words(s.p10, 1)}; ${words(s.p90, 1)}`], ["Minimum / maximum", `${words(s.min, 1)}; ${words(s.max, 1)}`]);
       if (state.difference) out.push(["RMS", q.kind === "classes" ? number(s.rms, 2) : words(s.rms, 1)], ["A above B, below B", `${percent(s.up)}, ${percent(s.down)}`], ["Only in A, only in B", `${percent(s.onlyA)}, ${percent(s.onlyB)}`]);
     }

@@ -1,7 +1,7 @@
 "use strict";
 // Values at points on the plan of the site or on a turning sphere of directions, at the pointer, and along a route.
 (async () => {
-  const { at, css, number, cells, fill, frame, axes, later, polyline } = common;
+  const { at, css, number, count, cells, fill, frame, axes, later, polyline } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
   const ramps = { level: common.ramp("viridis"), spread: common.ramp("plasma"), residual: common.ramp("RdBu_r") };
   document.documentElement.classList.add("live");
@@ -135,8 +135,8 @@
     if (!same) Object.assign(state, { zoom: 1, east: 0, north: 0 });
     fill(at("layer"), group().layers.map(l => l.name), state.layer, true);
     at("plan-buttons").hidden = sphere(); at("sphere-buttons").hidden = !sphere();
-    const n = arrays[group().at[0]].length, some = n < group().of ? ` ${n} of ${group().of} points are in this page; the files in the same folder contain all.` : "";
-    at("hint").textContent = `${sphere() || !data.note ? "" : data.note + " "}${sphere() ? "Drag turns" : "Drag moves"}; Ctrl + wheel or + and − zoom; arrows step.${group().dots.length && arrays[group().dots[0]].length ? " Dots: directions flown." : ""}${some}`;
+    const n = arrays[group().at[0]].length, some = n < group().of ? ` ${count(n)} of ${count(group().of)} points are in this page; the files in the same folder contain all.` : "";
+    at("hint").textContent = `${sphere() || !data.note ? "" : data.note + " "}Drag to ${sphere() ? "rotate" : "move"}; Ctrl + wheel or + and − to zoom; arrow keys move the pointer.${group().dots.length && arrays[group().dots[0]].length ? " Dots: directions flown." : ""}${some}`;
     const rows = () => [[...(sphere() ? ["x", "y", "z"] : ["east_m", "north_m", "up_m"]), ...group().layers.map(l => l.name)], ...Array.from({ length: n }, (_, k) => [...group().at.map(j => arrays[j][k]), ...group().layers.map(l => values(l)[k])])];
     at("saves").replaceChildren(common.downloads(canvas, group().name, rows, drawMap));
     everything();

@@ -46,9 +46,9 @@ def bench(
 @command("doctor", examples=["aerpaw-cmp doctor", "aerpaw-cmp doctor --json"])
 def doctor() -> int:
     """Check this machine."""
-    from ...machine import doctor as doctor_room
+    from ...machine.doctor import as_dict, checks, ready
 
-    checks = doctor_room.checks()
-    if not answered(doctor_room.as_dict(checks)):
-        records(checks, {"check": "name", "status": "status", "found": "found", "remedy": "remedy"})
-    return 1 if any(c.status == "fail" for c in checks) else 0
+    found = checks()
+    if not answered(as_dict(found)):
+        records(found, {"check": "name", "status": "status", "found": "found", "remedy": "remedy"})
+    return 0 if ready(found) else 1

@@ -425,9 +425,8 @@ class Sheet:
         words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
         if words:
             shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
-            said.append(
-                f"not read: {shown}. If one of them names the cell or device of a row, call it 'cell' or 'device'"
-            )
+            text = "If one names the cell or device of a row, call it 'cell' or 'device', or use --map NAME=cell"
+            said.append(f"not read: {shown}. {text}")
         gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         if gains:
             text = "changes, and levels are not corrected for it: do they already include it?"
@@ -845,7 +844,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     return timed
 
 
-_NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds")
+_NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds", "header stamp nsecs", "header stamp nanosec")
 _OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
 # Start of a log in a cell of JSON, written by Open DroneLog together with relative times.
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')

@@ -47,6 +47,8 @@ _UNITS = {"_deg": "deg", "_m": "m", "_mps": "m/s", "_dbm": "dBm", "_db": "dB"}
 _QUANTITIES = {row.name: row for row in dictionary.QUANTITIES if row.role in ("position", "height")}
 # Quantities whose names do not contradict a mapping to a column of the telemetry.
 _NO_POSE = ("time", "fix", "satellites")
+# Identities to which a column with an unknown name can be mapped.
+_NAMED = ("cell", "device")
 # Keys that divide a mapped table, besides devices: each part is a series.
 _KEYS = ("network", "PCI", "ARFCN")
 
@@ -55,7 +57,7 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     """Return the kind, and the position of the file column for each record column."""
     if options.kind is None:
         raise UsageError("the kind of the table is missing", expected="'kind:' telemetry, rss or rank")
-    allowed = ["time", *COLUMNS[options.kind], *_COMPANIONS.get(options.kind, ())]
+    allowed = ["time", *_NAMED, *COLUMNS[options.kind], *_COMPANIONS.get(options.kind, ())]
     if unknown := sorted(set(options.columns) - set(allowed)):
         found = f"'columns:' names {unknown[0]!r}, which a {options.kind} record does not have"
         raise unknown_name(found, unknown[0], allowed)
@@ -143,6 +145,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     kind, where = _checked(options, header)
     sheet = _sheet.cut(lines, first, separator, header)
     sheet.used |= {*where.values()}
+    for name in {*_NAMED} & {*where}:
+        sheet.names[where.pop(name)] = name
     sheet.said = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
     rows = _sheet.rows(sheet, options, reader="generic_csv", column=where.pop("time"))
     for column in (where[name] for name in _VALUE[kind]):

@@ -101,6 +101,22 @@ def test_a_column_of_an_unknown_name_that_takes_turns_with_the_level_joins_the_k
     assert sorted(map(sorted, found)) == [[0], [1], [2]]
 
 
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("in_turns", [True, False])
+def test_names_in_an_unknown_column_divide_the_levels_or_are_reported(
+    seed: int, in_turns: bool, tmp_path: Path
+) -> None:
+    """Levels of equal sources show nothing, and a handover is a single change."""
+    chance, count = random.Random(seed), 40
+    name = "x" + "".join(chance.choice("bcdfghjklmnpqrstvwxz") for _ in range(5))
+    values = [f"{chance.choice('ABC')}{chance.randrange(100)}-{i}" for i in range(chance.randrange(2, 6))]
+    sources = [values[i % len(values) if in_turns else i * len(values) // count] for i in range(count)]
+    rows = "".join(f"{1749564000 + i},{source},{-80 - i % 7}\n" for i, source in enumerate(sources))
+    result = read(tmp_path / "x.csv", f"time,{name},rsrp\n{rows}")
+    divided = sum(stream.kind == "rss" for stream in result.streams) == len(values)
+    assert divided or any(f"not read: '{name}'" in text for text in result.warnings), result.warnings
+
+
 def test_rows_whose_identity_is_empty_are_no_part_of_another(tmp_path: Path) -> None:
     rows = "".join(f"{1749564000 + i},{'' if i % 2 else 'A'},{-70 - 40 * (i % 2)}\n" for i in range(20))
     levels = [set(s.frame["rss_db"]) for s in read(tmp_path / "x.csv", f"time,operator,rsrp\n{rows}").streams]

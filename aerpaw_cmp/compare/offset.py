@@ -105,11 +105,6 @@ class Moments:
         # hypot, because squaring a difference of 1e200 would overflow
         return np.asarray(np.hypot(np.sqrt(self.variance_db2), self.mean_db - offset_db))
 
-    def fit_at(self, grid_db: FloatArray, best: int) -> OffsetFit:
-        """Return the fit of the offset with the index ``best`` in a grid."""
-        rmse = float(self.rmse_db(grid_db[best]))
-        return OffsetFit(float(grid_db[best]), rmse, self.n, best in (0, len(grid_db) - 1))
-
 
 def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Moments:
     """Return the moments of the pairs with both sides finite, NaN if there are no pairs.
@@ -172,4 +167,5 @@ def grid_offset(
     grid, moments = offset_grid(step_db, span_db), difference_moments(measured_db, simulated_db)
     if not moments.n:
         return _NO_FIT
-    return moments.fit_at(grid, nearest_offset(grid, moments.mean_db, step_db))
+    best = nearest_offset(grid, moments.mean_db, step_db)
+    return OffsetFit(float(grid[best]), float(moments.rmse_db(grid[best])), moments.n, best in (0, len(grid) - 1))

@@ -84,11 +84,6 @@ class RssRow:
     verdicts: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def key(self) -> tuple[str, str, str]:
-        """The flight, tower and channel."""
-        return self.flight, self.tower, self.channel
-
-    @property
     def moments(self) -> Moments:
         """The moments of simulated minus measured level over the scored samples."""
         return self.difference or difference_moments(self.measured_db, self.simulated_dbm)
@@ -650,7 +645,7 @@ def failures_card(data: CampaignData) -> Card:
 
 def repeats_card(data: CampaignData) -> Card:
     """Return the card of pairs of flights at the same positions."""
-    rmse = {row.key: row.rmse_db for row in data.reference_rows}
+    rmse = {(row.flight, row.tower, row.channel): row.rmse_db for row in data.reference_rows}
 
     def errors(pair: PassPair) -> str:
         return ", ".join(number(rmse.get((name, pair.tower, pair.channel))) for name in (pair.first, pair.second))

@@ -31,7 +31,8 @@ from ..site.site import Site
 
 _Key = TypeVar("_Key")
 _ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
-_RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
+# Closer together downwards, because the level changes faster near the ground.
+_RISES_M = (-150.0, -125.0, -100.0, -75.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
 
 
 def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> tuple[Cause | None, str | None]:
@@ -388,7 +389,10 @@ class _Direct:
             return {}
         begin_m = data.track.pose_at(np.array([data.track.start_ns], dtype="datetime64[ns]")).position_m[0, :2]
         mirrored_m = np.column_stack([begin_m + (position_m[:, :2] - begin_m)[:, ::-1], position_m[:, 2]])
-        levels = {_MIRRORED: self.level(position_m=mirrored_m, tower=True)}
+        # without attitude, level flight along the course is assumed, and the course is mirrored as well
+        course = used != "ignored" and not track.attitude_known.any()
+        rotation = turned(90.0) @ self.replayed.poses.rotation.transpose(0, 2, 1) if course else None
+        levels = {_MIRRORED: self.level(position_m=mirrored_m, rotation=rotation, tower=True)}
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
                 # channels with the same times share the attitude

@@ -447,6 +447,26 @@ def test_a_displaced_tower_is_no_error_of_height_and_has_its_side() -> None:
     assert _named(replace(e, measured_db=e.predicted_db + noise)) == NONE
 
 
+def test_a_height_between_the_searched_ones_explains_the_error_near_the_ground() -> None:
+    """The UAV flew at 35 m, 25 m above the antenna of the tower, and the log says 122 m."""
+    sound = _sound()
+    along, beside = 400.0 * np.sin(sound.time_s / 37.0), 60.0 * np.cos(sound.time_s / 61.0)
+
+    def level(height_m: float) -> np.ndarray:
+        flat = np.hypot(along, beside)
+        distance = np.hypot(flat, height_m - 10.0)
+        return np.asarray(20.0 * np.log10((flat / distance + 0.05) / distance))  # a vertical dipole
+
+    raised = {rise: level(122.0 + rise) - level(122.0) for rise in likely_cause._RISES_M}
+    noise = sound.measured_db - sound.predicted_db
+    cause = flight_cause([replace(sound, predicted_db=level(122.0), measured_db=level(35.0) + noise, raised_db=raised,
+                                  turned_db={}, other_towers_db={})])  # fmt: skip
+    assert cause is not None
+    assert cause.name == "height"
+    assert cause.estimate == pytest.approx(-87.0, abs=2.0)
+    assert cause.rmse_with_db == pytest.approx(float(noise.std()), rel=0.1)
+
+
 def test_a_clock_that_drifts_is_no_constant_lag() -> None:
     sound = _sound(n=600)
     late = np.interp(0.98 * sound.time_s, sound.time_s, sound.predicted_db) + sound.measured_db - sound.predicted_db

@@ -546,3 +546,28 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     assert (parts.locked_sd_db, parts.lost_sd_db) == (7.0, 8.0)
     case.series.locked = None
     assert compare_flight._with_lock(case, score, stated) is stated
+
+
+@pytest.mark.parametrize("used", ["level", "ignored"])
+def test_a_mirrored_track_without_attitude_mirrors_its_course(monkeypatch: pytest.MonkeyPatch, used: str) -> None:
+    """The nose follows the course, so north-east by east becomes north-east by north."""
+    heading = np.array([56.25, 0.0, 200.0])
+    rotation = rotation_from_aircraft(0.0 * heading, 0.0 * heading, heading)
+    poses = SimpleNamespace(
+        position_m=np.array([[1.0, 2.0, 40.0], [9.0, 2.0, 40.0], [9.0, 5.0, 40.0]]), rotation=rotation
+    )
+    replayed: Any = SimpleNamespace(
+        poses=poses, track=SimpleNamespace(attitude_known=np.zeros(3, dtype=np.bool_)),
+        link=SimpleNamespace(uav_array=SimpleNamespace(patterns=())),
+    )  # fmt: skip
+    begin = SimpleNamespace(position_m=poses.position_m[:1])
+    data: Any = SimpleNamespace(
+        track=SimpleNamespace(start_ns=0, pose_at=lambda _: begin), settings=SimpleNamespace(rss_attitude=used)
+    )
+    monkeypatch.setattr(likely_cause._Direct, "level", lambda _, **at: at)
+    link = likely_cause._Direct(site=None, tower="LW1", replayed=replayed, rotations={})  # type: ignore[arg-type]
+    ((meaning, at),) = link.misread_db(data, np.zeros(3, dtype="datetime64[ns]")).items()
+    assert meaning == "east and north of the track are swapped"
+    np.testing.assert_allclose(at["position_m"], [[1.0, 2.0, 40.0], [1.0, 10.0, 40.0], [4.0, 10.0, 40.0]])
+    mirrored = rotation_from_aircraft(0.0 * heading, 0.0 * heading, 90.0 - heading)
+    np.testing.assert_allclose(at["rotation"], mirrored if used == "level" else rotation, atol=1e-12)

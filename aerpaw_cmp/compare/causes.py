@@ -111,25 +111,26 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         used = frozenset().union(*map(_names, models))
         odds[used] = sum(model.gain for model in models) - _SELDOM * len(used) - _unpaid(models)
     best = max(odds, key=lambda some: odds[some])
-    least, named = _MARGIN + math.log(max(len(channels), 1)), dict[frozenset[str], list[_Models]]()
-    alternatives = _alternatives(best, odds, least)
-    certain = frozenset().union(*(either for either in alternatives if len(either) == 1))
-    for either in alternatives:
-        if any(either < pair for pair in named):
-            continue
-        name = max(either & best)
-        # the UAV has one height and one attitude, and a tower one place, so all their channels must show the error
-        of_all = all(_conditions(each).of_uav for each in either)
-        shown = [table for table in tables if of_all or name in _names(_best(table, best))]
-        if any(_conditions(each).of_tower for each in either):
-            towers = {table[_SOUND].evidence.tower for table in shown}
-            shown = [table for table in tables if table[_SOUND].evidence.tower in towers]
-        # the sentence quotes the channel that shows the cause most clearly
-        shown.sort(key=lambda table: -_best(table, {name}).gain)
-        if all(
-            _explains(other, shown, _lead(either, odds) / len(shown), (best & certain) - either) for other in either
-        ):
-            named[either] = shown
+    alternatives = _alternatives(best, odds, _MARGIN + math.log(max(len(channels), 1)))
+    beside = certain = frozenset().union(*(either for either in alternatives if len(either) == 1))
+    for _ in range(2):
+        named = dict[frozenset[str], list[_Models]]()
+        for either in alternatives:
+            if any(either < pair for pair in named):
+                continue
+            name = max(either & best)
+            # the UAV has one height and one attitude, and a tower one place, so all their channels must show the error
+            of_all = all(_conditions(each).of_uav for each in either)
+            shown = [table for table in tables if of_all or name in _names(_best(table, best))]
+            if any(_conditions(each).of_tower for each in either):
+                towers = {table[_SOUND].evidence.tower for table in shown}
+                shown = [table for table in tables if table[_SOUND].evidence.tower in towers]
+            # the sentence quotes the channel that shows the cause most clearly
+            shown.sort(key=lambda table: -_best(table, {name}).gain)
+            if all(_explains(other, shown, _lead(either, odds) / len(shown), beside - either) for other in either):
+                named[either] = shown
+        # a cause that may not be named takes no credit for a part of the error
+        beside = certain & frozenset().union(*named)
     # an almost certain cause that may not be named shows that no explanation fits
     if any(_lead({other}, odds) >= _CERTAIN for other in certain - frozenset().union(*named)):
         named = {either: shown for either, shown in named.items() if CATCH_ALL not in either}
@@ -252,8 +253,7 @@ class _Conditions:
     follows : float, optional
         Largest remaining error as a share of that of a constant level, which fits a log of noise best.
     most_left : float
-        Largest remaining error, as a multiple of the largest error of a held-out flight. With 1, a cause that restores
-        the usual error does not need the smallest reduction.
+        Largest remaining error, as a multiple of the largest error of a held-out flight.
     """
 
     lead: float = -math.inf
@@ -320,14 +320,11 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         return False
     if usual is None:
         enough = not need.part or after_db <= before_db - need.part * (before_db - _together_db(shown))
-        restored = False
     else:
-        # the error is larger than on any held-out flight, and usual after correcting the cause
-        restored = need.most_left == 1.0 and name != CATCH_ALL and known_db > usual[1] >= alone_db
         # do not name such a cause for an error that held-out flights also have
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0
         enough = known_db > least_db and alone_db <= need.most_left * usual[1]
-    return enough and (share <= 1.0 - least_share or certain or restored)
+    return enough and (share <= 1.0 - least_share or certain)
 
 
 def _holds_in_halves(models: Sequence[_Model], most: float) -> bool:
@@ -861,13 +858,13 @@ _SLOPE = 0.5
 # receiver among obstacles [m].
 _STEEP, _NEAR_GROUND_M = 1.25, 10.0
 # Largest relative difference of a slope from 0.5 and 2, for any antennas and for learned ones. The slope of learned
-# antennas on held-out flights is 0.95 to 1.09.
+# antennas is 0.95 to 1.09 on held-out flights of dataset 12, and 0.9 on the LTE flight at 50 m.
 _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {0.5: 0.1, 2.0: 0.05}, {0.5: 0.12, 2.0: 0.1}
 
 
 def _is_slope(e: LevelEvidence, factor: float, at: NoiseParameters) -> bool:
     """Check whether the 95 % interval of the slope is near a factor."""
-    step = factor * (_SLOPE_SHARE if e.learned is None else _LEARNED_SLOPE_SHARE)[factor]
+    step = factor * (_LEARNED_SLOPE_SHARE if e.antenna == "learned" else _SLOPE_SHARE)[factor]
     best, sd = _slope(e, factor, step, at)
     return abs(best - factor) <= step and abs(best - factor) + 1.96 * sd < 2.0 * step
 

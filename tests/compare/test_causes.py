@@ -689,6 +689,14 @@ def test_levels_that_fall_faster_without_antennas_have_another_exponent(
     assert "obstacles" in walk.next_step
 
 
+def test_antennas_that_one_flight_taught_have_the_range_of_slopes_of_learned_ones() -> None:
+    """Antennas learned on one flight have no errors of held-out flights. The slope of LTE flights is 0.9."""
+    sound, extra = _sound(), np.random.default_rng(2).normal(0.0, 10.0, 300)
+    e = replace(sound, measured_db=sound.measured_db + sound.predicted_db + extra, antenna="learned")
+    assert e.learned is None
+    assert [_named(e), _named(replace(e, antenna="measured"))] == ["decibels", NONE]
+
+
 def test_heights_that_jump_are_not_in_another_unit() -> None:
     evidence = _planted()["telemetry"]
     meaning = {"the logged heights are in feet": evidence.misread_db["in feet"]}
@@ -734,6 +742,22 @@ def test_each_of_two_causes_is_judged_by_the_error_that_the_other_leaves() -> No
     sound = _sound()
     change = sound.other_towers_db["LW3"] - sound.predicted_db + 7.0 * (sound.time_s > 150.0)
     assert _named(replace(sound, measured_db=sound.measured_db + change)) == "tower"
+
+
+def test_a_cause_that_may_not_be_named_takes_no_credit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A floor that the settings remove explains most of the error of swapped axes, and another small error."""
+    sound = _sound()
+    swapped, rest, other = (
+        size * np.sin(sound.time_s / period) for size, period in ((5.0, 7.0), (1.2, 4.0), (2.0, 11.0))
+    )
+    candidates = (
+        lambda _: iter([Trial(name="telemetry", change_db=swapped)]),
+        lambda _: iter([Trial(name="floor", columns=np.column_stack([swapped + rest, other]))]),
+    )
+    monkeypatch.setattr(causes, "CANDIDATES", candidates)
+    monkeypatch.setattr(causes, "_together_db", lambda _: 0.5)
+    e = replace(sound, measured_db=sound.measured_db + swapped + other, floored=True)
+    assert _named(e) == "telemetry"
 
 
 @pytest.mark.parametrize(("size_db", "named"), [(0.0, "pattern"), (0.8, NONE)])

@@ -156,6 +156,8 @@ _ANY_RAT = re.compile(r"(?i)lte|nr|\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that need no conversion.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
+# Further texts in a line of units: a count, a ratio and the zone of times.
+_BESIDE_UNITS = ("#", "-", "1", "UTC", "GMT")
 
 
 @dataclass
@@ -703,7 +705,7 @@ class _Header:
         """Check whether the line below the names contains their units, and add the units to the names."""
         texts = [text.strip("[]()") for text in texts]
         filled = [text for text in texts if text]
-        units = sum(dictionary.is_unit(text) or text in _HARMLESS for text in filled)
+        units = sum(dictionary.is_unit(text) or text in (*_HARMLESS, *_BESIDE_UNITS) for text in filled)
         if len(texts) != len(self.names) or len(filled) < 2 or 2 * units <= len(filled):
             return False
         self.names[:] = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, texts, strict=True)]

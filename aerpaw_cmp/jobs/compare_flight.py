@@ -82,7 +82,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     results = []
     for series, replayed in zip(data.rss, replays.rss, strict=True):
         results.append(compare_rss_series(data, series, replayed))
-        give_memory_back()  # the ranks need the 100 MiB of fragmented memory that remain after a series of ten hours
+        give_memory_back()  # a series of ten hours leaves 100 MiB fragmented, which the ranks need
     results = with_corrected_verdicts(results)
     cause, step = cause_of(data, replays, results)
     return FlightResult(

@@ -223,7 +223,7 @@ def _instant(text: str, first: Any, zone: str | None) -> Any:
 def _pose(
     data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
 ) -> tuple[Link, Poses, list[str], Times]:
-    """Return link and pose of a sample as in the report, notes, and the time (1,) on the clock of the telemetry."""
+    """Return the link and pose that the report uses for a sample, notes, and the time (1,) by the telemetry clock."""
     notes: list[str] = []
     if isinstance(series, RssSeries):
         time = series.time

@@ -640,9 +640,19 @@ class Poses:
 class Link:
     """Radio settings of a replay.
 
-    ``tower_arrays`` maps tower names to arrays, in replay order. The channel matrix is always
-    ``(n_rx, n_tx)``; ``uav_transmits`` decides which end is which. A link received below ``noise_floor_dbm`` is out of
-    coverage. The default is the thermal noise of 1 Hz, below which no receiver works.
+    Parameters
+    ----------
+    carrier_hz : float
+        Carrier frequency [Hz].
+    tower_arrays : mapping of str to Array
+        Array of each tower, by name, in the order of the replay's tower axis.
+    uav_array : Array
+    transmit_power_dbm : float
+        Power of all ports together.
+    uav_transmits : bool
+        True if the UAV transmits. The channel matrix is always ``(n_rx, n_tx)``.
+    noise_floor_dbm : float
+        A link received below this level is out of coverage. Default: thermal noise of 1 Hz.
     """
 
     carrier_hz: float

@@ -74,8 +74,8 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
               for c in data.candidates],
         notes=["The number is the error to expect of a predicted level about the mean of a later flight, without that "
                "flight's own shadowing, fading and noise. It depends on positions and headings alone, not on the "
-               "levels that will be measured. Use it to choose a flight. Single waypoints that it "
-               "placed were not better than a lawnmower of the same length."],
+               "levels that will be measured. Use it to choose a flight. Routes whose single "
+               "waypoints were chosen by it were not better than a lawnmower of the same length."],
     )  # fmt: skip
     curve = Table(
         caption="Expected standard deviation by flight time, after the best of three candidates of that length.",

@@ -156,7 +156,7 @@ class Site:
     trees : Trees
         Placed trees (from forests without a height and single points).
     opaque_trees : Trees
-        Placed trees, and the trees of forest stands that also have single trees.
+        Trees for opaque foliage: the placed trees, and those that replace a forest stand with ``trees: true``.
     ground_material : str
         Name of a material in ``site.materials``.
     area_m : (east_min, east_max, north_min, north_max)

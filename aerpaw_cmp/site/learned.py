@@ -40,7 +40,7 @@ from ..common.units import FloatArray, db_from_power, power_from_db
 from ..common.yamlfile import StrictModel, dump_yaml, load_yaml, parse_yaml
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
 
-_INDEX, DAMAGED = "learned.yaml", "learned.damaged.yaml"
+_INDEX = "learned.yaml"
 
 # Relative difference of carriers up to which an antenna of a tower is used.
 # The bands of Lake Wheeler at 3.3, 3.4 and 3.51 GHz differ by 3 % and have different antennas and gains.
@@ -430,8 +430,13 @@ def mend_remark(folder: Path, learning: Container[str]) -> list[str]:
     if damage is None:
         return []
     again = [f"{name} ({command})" for name, command in lost.items() if name not in learning]
-    text = f"{damage.path} was damaged and is written again; its damaged content is kept in {DAMAGED}"
+    text = f"{damage.path} was damaged and is written again; its damaged content is kept in {damaged_copy(folder).name}"
     return [text + (f"; learn again: {', '.join(again)}" if again else "")]
+
+
+def damaged_copy(folder: Path) -> Path:
+    """Return the path for a copy of a damaged index. The name contains its digest, so no other copy is replaced."""
+    return folder / f"learned.damaged-{file_digest(folder / _INDEX)[:12]}.yaml"
 
 
 class _AnyEntries(BaseModel):
@@ -495,7 +500,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         with locked(folder):
             memory, _, damage = mended_index(folder)
             if damage is not None:
-                write_whole(folder / DAMAGED, (folder / _INDEX).read_bytes())
+                write_whole(damaged_copy(folder), (folder / _INDEX).read_bytes())
             # files with a digest in an entry are ours, and so are an edited table and tables of a killed calibration
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:

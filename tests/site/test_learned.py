@@ -502,8 +502,21 @@ def test_a_damaged_index_is_refused_and_written_again_with_its_intact_entries(fo
     assert ("learn again: other (aerpaw-cmp calibrate o.yaml)" in remark) is (damage == "cut")
     remember(site, "new", entry("C"), learned_tables("C"))
     assert read_learned(site).entries.keys() == {*intact.get(damage, {"other"}), "new"}
-    assert (index.parent / memory.DAMAGED).read_text() == before
+    (kept,) = index.parent.glob("learned.damaged*")
+    assert kept.read_text() == before
+    assert kept.name in remark
     assert memory.mend_remark(index.parent, []) == []
+
+
+def test_every_damaged_index_is_kept(folder: Path) -> None:
+    site, index = folder / "mine.yaml", folder_of(folder / "mine.yaml") / "learned.yaml"
+    contents = set()
+    for damage in ("an open quote", "empty", "not text", "empty"):
+        index.write_text(DAMAGES[damage](index.read_text()))
+        contents.add(index.read_text())
+        remember(site, "other", learned_entry(learned_series("B")), learned_tables("B"))
+    assert {kept.read_text() for kept in index.parent.glob("learned.damaged*")} == contents
+    assert len(contents) == 3
 
 
 def test_the_error_to_expect_is_that_of_flights_of_the_same_kind() -> None:

@@ -8,7 +8,7 @@ does not show should not be modelled (Breiman, Friedman, Olshen, Stone 1984, sec
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,7 +66,7 @@ class ModelRow:
         True for the simplest model within one standard error of the best, over all series of the flight. If the errors
         on other flights are known from a calibration, the model with the lowest error there is recommended instead.
     fastest_sufficient : bool
-        True for the fastest model whose difference to the best is not significant.
+        True for the first model, in the order of rising cost, whose difference to the best is not significant.
     distinct : bool
         False if the error is within 0.01 dB of that of an earlier model on every channel. The recommended model and
         that of the flight file are always distinct.
@@ -179,7 +179,8 @@ def compare_models(
     time_s : sequence of (n,)
         Times by which the errors of all series are ordered, so that correlated errors of channels are adjacent [s].
     candidates : sequence of CandidateModel
-        Models, simplest first. Of two equal models, the earlier one is used.
+        Models, simplest first: lines, then more and more paths and losses, which is also the order of their cost. Of
+        two equal models, the earlier one is used.
     position_m : sequence of (n, 3)
         Position of each sample [m]; areas are held out (:func:`places_of`).
 
@@ -226,25 +227,36 @@ def compare_models(
 
 
 def model_rows(
-    ladder: ModelComparison, series: int | None = None, *, tower: str | None = None, channel: str | None = None
-) -> list[ModelRow]:
-    """Return the score of each model, simplest first. Empty if no models were compared.
+    ladder: ModelComparison, names: Sequence[tuple[str, str]] = ()
+) -> tuple[tuple[ModelRow, ...], tuple[ModelRow, ...]]:
+    """Return the scores of the models, simplest first. Empty if no models were compared.
 
     Parameters
     ----------
     ladder : ModelComparison
-    series : int, optional
-        Index of the series to score. By default, all channels are scored together.
-    tower, channel : str, optional
-        Names of this series.
+    names : sequence of (str, str)
+        Tower and channel of each series.
 
     Returns
     -------
-    list of ModelRow
+    tuple of ModelRow, tuple of ModelRow
+        The scores over all series, and on each named series.
     """
+    distinct = _distinct(ladder)
+    each = [row for i, name in enumerate(names) for row in _rows(ladder, [i], distinct, *name)]
+    return tuple(_rows(ladder, range(len(ladder.time_s)), distinct)), tuple(each)
+
+
+def _rows(
+    ladder: ModelComparison,
+    of: Sequence[int],
+    distinct: Container[int],
+    tower: str | None = None,
+    channel: str | None = None,
+) -> list[ModelRow]:
+    """Return the score of each model over some series. Empty if no models were compared."""
     if ladder.best is None:
         return []
-    of = range(len(ladder.time_s)) if series is None else [series]
     place = [ladder.position_m[i] for i in of]
     pairs = [
         pooled_difference([(ladder.time_s[i], errors[i], ladder.error_db[ladder.best][i]) for i in of],
@@ -253,8 +265,7 @@ def model_rows(
     ]  # fmt: skip
     # sufficient: the best model, and models whose difference has a known interval that contains 0
     sufficient = [i for i, pair in enumerate(pairs) if i == ladder.best or pair.difference_ci95_db[0] <= 0.0]
-    fastest = min(sufficient, key=lambda i: ladder.candidates[i].seconds)
-    distinct = _distinct(ladder)
+    fastest = min(sufficient)  # the order of the candidates, because measured seconds differ between equal runs
     return [
         ModelRow(
             model=candidate.model,
@@ -276,12 +287,13 @@ def model_rows(
 
 def _distinct(ladder: ModelComparison) -> set[int]:
     """Return the indices of models with another error than every model before them, of the last and the recommended."""
-    known: dict[int, FloatArray] = {}
-    for index, errors in enumerate(ladder.error_db):
-        own = np.array([_rmse(error) for error in errors])
-        alike = any(np.allclose(own, other, rtol=0.0, atol=_SAME_DB, equal_nan=True) for other in known.values())
-        if not alike or not np.isfinite(own).any() or index in (ladder.recommended, len(ladder.error_db) - 1):
-            known[index] = own
+    rmse = np.array([[_rmse(error) for error in errors] for errors in ladder.error_db])
+    rmse = np.nan_to_num(rmse, nan=-1.0)  # a channel without an error is like others without one
+    known: list[int] = []
+    for index, own in enumerate(rmse):
+        alike = (np.abs(rmse[known] - own) <= _SAME_DB).all(axis=1).any()
+        if not alike or (own < 0.0).all() or index in (ladder.recommended, len(rmse) - 1):
+            known.append(index)
     return set(known)
 
 

@@ -612,10 +612,8 @@ def run_flight(
             stages.progress("model comparison")
             comparison = flight_comparison(data, replays)
             if comparison is not None:
-                scores, names = comparison.scores, enumerate(comparison.names)
-                each = (model_rows(scores, i, tower=tower, channel=channel) for i, (tower, channel) in names)
-                ladder_rows = tuple(row for rows in each for row in rows)
-                result = dataclasses.replace(result, models=tuple(model_rows(scores)), ladder=ladder_rows)
+                pooled, each = model_rows(comparison.scores, comparison.names)
+                result = dataclasses.replace(result, models=pooled, ladder=each)
     result = dataclasses.replace(result, likely_cause=cause_beyond_models(result.likely_cause, comparison))
     result = dataclasses.replace(result, next_step=next_step(data, result, comparison))
     return FlightRun(data=data, replays=replays, result=result, ladder=comparison)

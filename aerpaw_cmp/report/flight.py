@@ -360,8 +360,9 @@ def models_card(data: ReportData) -> Card:
              estimate(row.difference_to_best_db, row.difference_to_best_ci95_db), row.seconds, notes[row.model])
             for number, row in enumerate(shown, 1)
         ],
-        notes=["The recommended model is the simplest replay within one standard error of the best replay. The fastest "
-               "sufficient model is the fastest whose difference to the best model is not significant.",
+        notes=["The recommended model is the simplest replay within one standard error of the best replay. Models are "
+               "listed by rising cost. The fastest sufficient model is the first whose difference to the best model is "
+               "not significant.",
                *([f"Within 0.01 dB of a row above on every channel: {'; '.join(same)}."] if same else [])],
     )  # fmt: skip
     each = Table(

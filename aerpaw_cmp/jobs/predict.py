@@ -153,19 +153,18 @@ def predict(
     with stages("read"):
         known, remarks = counted_once([flight.load(logs_root) for flight in flights])
         site, place = site_of(where, flights, known, options.site)
+        targets = find_targets(where, site, options, logs_root)
         unflown = None if known else _unflown(where, place, site, options)
         if unflown is not None:
-            asked = _nodes_of(where)
             every = unflown.sources()
             if isinstance(unflown, Prior) and options.carrier_hz is None and (learned := latest_learned_links(place)):
                 remarks.append(f"Not used: the antennas learned for {', '.join(learned)} have no level.")
-            sources = {name: s for name, s in every.items() if s.tower in asked} or every
+            sources = {name: s for name, s in every.items() if s.tower in targets.towers} or every
         else:
             observed, about_logs = observe(known)
             sources = sources_of(known, observed)
             remarks += about_logs
-        _check_shared(where, sources, site, "the flights received" if known else "the site has")
-        targets = find_targets(where, site, options, logs_root)
+        _check_shared(where, sources, targets.towers, "the flights received" if known else "the site has")
     work = f"{counted(len(targets.position_m), 'point')}: {', '.join(sources)}"
     stages.checked(lambda: [PlannedStage("choose, predict", work)])
     with stages("choose"):
@@ -318,17 +317,10 @@ def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions)
     return Prior(site, LinkSettings(carrier_hz=carrier_hz, transmit_power_dbm=budget.tx_power_dbm))
 
 
-def _nodes_of(where: Path) -> set[str]:
-    """Return the nodes of the logs of a flight file. The set is empty if WHERE is not a flight file."""
-    planned = flight_of(where)
-    return set() if planned is None else {log.node for log in planned.logs if log.node}
-
-
-def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: str) -> None:
-    """Raise UsageError if no source has a tower of the site, or a tower and band of the planned flight."""
+def _check_shared(where: Path, sources: Mapping[str, Source], nodes: frozenset[str], who: str) -> None:
+    """Raise UsageError if no source has one of the towers ``nodes`` (if there are any) and a band of the flight."""
     planned = flight_of(where)
     towers, bands = {s.tower for s in sources.values()}, {s.link.carrier_hz for s in sources.values()}
-    nodes = _nodes_of(where) if planned is not None else set(site.towers) | towers
     links = [planned.link.rss, *planned.link.channels.values()] if planned is not None else []
     carriers = {link.carrier_hz for link in links if "carrier_hz" in link.model_fields_set}
     near = not carriers or any(abs(a / b - 1.0) <= CARRIER_BAND for a in carriers for b in bands)

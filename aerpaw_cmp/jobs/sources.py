@@ -71,6 +71,8 @@ class Targets:
     grid : Grid, optional
         The grid, if the points are its positions, in order of height.
     heights_m : tuple of float
+    towers : set of str
+        Towers of the levels and ranks of a flight, or those that its file names. Empty if they are not known.
     remarks : tuple of str
     """
 
@@ -82,6 +84,7 @@ class Targets:
     up: FloatArray = field(default_factory=lambda: UPRIGHT)
     grid: Grid | None = None
     heights_m: tuple[float, ...] = ()
+    towers: frozenset[str] = frozenset()
     remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -239,7 +242,13 @@ def _planned(flight: FlightFile, site: Site) -> Targets:
     assert flight.flight.plan is not None
     time, position, yaw = planned_poses(flight.flight.plan, site.takeoff_ground_m, 1.0)
     up, name = _leaning(position, time), flight.flight.name
-    return Targets(kind="route", name=name, position_m=position, yaw_deg=yaw % 360.0, time_s=time, up=up)
+    return Targets(
+        kind="route", name=name, position_m=position, yaw_deg=yaw % 360.0, time_s=time, up=up, towers=_named(flight)
+    )
+
+
+def _named(flight: FlightFile) -> frozenset[str]:
+    return frozenset(name for log in flight.logs for name in (log.node, *log.cells.values()) if name)
 
 
 def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
@@ -269,6 +278,7 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
         yaw_deg=pose.heading_deg[pose.valid],
         up=attitude_rotation(pose, data.settings.rss_attitude)[pose.valid][:, :, 2],
         time_s=((time - time[0]) / np.timedelta64(1, "s"))[pose.valid],
+        towers=frozenset(series.tower for _, series in data.series) or _named(flight),
         remarks=("The flight file has no plan: its track is the route. Its levels are not used.",),
     )
 
@@ -284,11 +294,13 @@ def _local_points(path: Path) -> Targets | None:
     with parsing(path, "columns east_m, north_m, height_m"):
         with path.open("rb") as file:
             head = file.readline(HEAD_BYTES).decode("utf-8-sig", errors="replace")
-        if not set(_COLUMNS[:3]) <= {name.strip() for name in head.split(",")}:
+        sign = ";" if ";" in head else ","
+        if not set(_COLUMNS[:3]) <= {name.strip() for name in head.split(sign)}:
             return None
         # read one row more than allowed, so that a longer table is refused before all of it is in memory
         table = pd.read_csv(
             path, skipinitialspace=True, nrows=MOST_POINTS + 1, encoding="utf-8-sig", index_col=False,
+            sep=sign, decimal="," if sign == ";" else ".",  # pandas leaves decimal points as text, converted below
             usecols=lambda name: name.strip() in _COLUMNS,
         ).rename(columns=str.strip)  # fmt: skip
         if len(table) > MOST_POINTS:

@@ -153,6 +153,16 @@ def test_no_flight_that_shares_a_tower_is_one_message(small):
         predict.predict(small / "points.csv", [])
 
 
+def test_points_of_a_spreadsheet_may_have_decimal_commas(tmp_path):
+    commas, points = tmp_path / "commas.csv", tmp_path / "points.csv"
+    commas.write_text("east_m;north_m;height_m;yaw_deg\n-300,5;150;30;20,5\n10;20;30;\n")
+    points.write_text("east_m;north_m;height_m;yaw_deg\n-300.5;150;30;20.5\n10;20;30;\n")
+    for path in (commas, points):
+        targets = find_targets(path, load_site("lake_wheeler"), TargetOptions())
+        assert targets.position_m.tolist() == [[-300.5, 150.0, 30.0], [10.0, 20.0, 30.0]]
+        assert targets.yaw_deg[0] == 20.5
+
+
 def test_a_file_without_positions_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("east_m,north_m,height_m\n,,\n")
     with pytest.raises(InputError, match="no point has a position"):
@@ -603,3 +613,17 @@ def test_a_route_that_cannot_be_flown_here_is_a_question(
     call = ["predict", str(tmp_path / "route.csv"), "--site", "lake_wheeler", "-o", str(tmp_path / "out")]
     assert main(call) == 3
     assert message in capsys.readouterr().err
+
+
+def test_towers_of_a_table_column_are_those_that_are_predicted(tmp_path: Path) -> None:
+    """The flight file does not name a tower, because each row of its log does."""
+    rows = [
+        f"2025-01-01T12:{i // 60:02}:{i % 60:02}Z,{35.7275 + 1e-5 * i:.6f},-78.696,{min(8 * i, 40)},{tower},{-70 - 0.1 * i:.1f}"
+        for i in range(120)
+        for tower in ("LW1", "LW3")
+    ]
+    (tmp_path / "table.csv").write_text("\n".join(["time,latitude,longitude,altitude_m,tower,rsrp_dbm", *rows]))
+    flight = tmp_path / "flight.yaml"
+    flight.write_text("flight: {name: f}\nsite: {file: lake_wheeler}\nlogs: [{path: table.csv, timezone: UTC}]\n")
+    made = predict.predict(flight, [], TargetOptions(carrier_hz=3.3e9))
+    assert {source.tower for source in made.sources.values()} == {"LW1", "LW3"}

@@ -370,18 +370,19 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
 
 # --- tables ------------------------------------------------------------------------------------------
 
-_NUMBER = re.compile(r"\s*[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?\s*")
+_NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|\.\d+)([eE][-+]?\d+)?\s*")
 
 
 def _sheet(data: bytes) -> _Route:
     """Return the waypoints of a table, which without a header are latitude, longitude, height and yaw."""
     # read one line at a time, so that a table beyond the limit is refused before all of it is in memory
     text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace")
-    lines = (line for line in text if line.strip() and not line.lstrip().startswith("#"))
+    lines = (line for line in text if line.strip() and not line.lower().lstrip().startswith(("#", "sep=")))
     head = next(lines, None)
     if head is None:
         raise InputError("the file is empty", expected=_EXPECTED)
-    sign = max(",;\t", key=head.count)
+    # any semicolon or tab separates cells: commas may then be decimal commas
+    sign = next((sign for sign in "\t;" if sign in head), ",")
     # quoted names may contain the separator
     rows: Iterator[list[str]] = csv.reader(chain([head], lines), delimiter=sign, skipinitialspace=True)
     first = next(rows)
@@ -421,10 +422,12 @@ def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], unit
         Number of the row, for messages.
     """
     try:
-        cells = [(row[index].strip() if 0 <= index < len(row) else "", index) for index in columns.values()]
+        cells = [row[index].strip() if 0 <= index < len(row) else "" for index in columns.values()]
+        if not any("." in cell for cell in cells):  # next to a decimal point, a comma may separate thousands
+            cells = [cell.replace(",", ".") for cell in cells]
         values = [
             float(dictionary.converted(np.array(float(cell)), units[index])) if cell else math.nan
-            for cell, index in cells
+            for cell, index in zip(cells, columns.values(), strict=True)
         ]
     except ValueError as error:
         raise InputError(

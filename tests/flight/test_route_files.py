@@ -156,6 +156,29 @@ def test_a_table_with_its_own_yaw(tmp_path: Path) -> None:
     assert read_route(file)["yaw_deg"].tolist() == pytest.approx([90.0, 360 - math.degrees(0.1)])
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lat;lon;altitude_m\n35,7275;-78,696;30,5\n",
+        "35,7275;-78,696;30,5\n",
+        "35.7275;-78.696;30.5\n",
+        "lat\tlon\taltitude_m\n35,7275\t-78,696\t30,5\n",
+        "sep=;\r\nlat;lon;altitude_m\r\n35,7275;-78,696;30,5\r\n",
+        'lat,lon,altitude_m\n"35,7275","-78,696","30,5"\n',
+    ],
+)
+def test_a_table_of_a_spreadsheet_may_have_decimal_commas(text: str, tmp_path: Path) -> None:
+    (tmp_path / "route.csv").write_text(text)
+    route = read_route(tmp_path / "route.csv")
+    assert route[["latitude_deg", "longitude_deg", "altitude_m"]].to_numpy().tolist() == [[35.7275, -78.696, 30.5]]
+
+
+def test_a_comma_between_thousands_is_not_a_decimal_comma(tmp_path: Path) -> None:
+    (tmp_path / "route.csv").write_text("lat;lon;altitude_m\n35.7275;-78.696;1,300\n")
+    with pytest.raises(InputError, match="'1,300'"):
+        read_route(tmp_path / "route.csv")
+
+
 def test_the_track_of_a_log_is_a_route_with_times(tmp_path: Path) -> None:
     file = tmp_path / "vehicleOut.txt"
     file.write_bytes(samples.FILES["vehicle_out/ten_fields"])

@@ -582,7 +582,7 @@ class ClockTrap:
 
     def advice(self) -> str:
         """Return cause and remedy as text."""
-        return f"{self.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' next to the log"
+        return f"{self.explanation}; try 'timezone: ZONE' or 'clock: local | utc | local_as_utc' next to the log"
 
 
 def clock_trap(
@@ -646,8 +646,11 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
         if east and hours == east:
             stored = "telemetry times are local time stored as if they were UTC"
             return f"radio times are UTC read as {timezone}, or {stored}", True
-        if abs(hours) == 1.0:
-            return "one hour: daylight saving taken into account in one log only", False
+        # a log is read too late by hours if its zone is that many hours east of the named zone
+        fits = f"UTC{east - hours:+g} fits the radio times, UTC{east + hours:+g} the telemetry"
+        wrong = f"the clocks differ by {hours:+g} h: {timezone} (UTC{east:+g}) is the wrong zone ({fits})"
+        saving = ", or daylight saving was taken into account in one log only"
+        return wrong + (saving if abs(hours) == 1.0 else ""), False
     return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only", False
 
 

@@ -19,7 +19,7 @@ def test_whole_hours_are_recognised():
     assert "telemetry times are local time" in clock_trap(span, earlier, "America/New_York").explanation
     winter = tuple(s + np.timedelta64(180, "D") for s in span)
     late = tuple(s - np.timedelta64(4, "h") for s in winter)
-    assert "time zone" in clock_trap(late, winter, "America/New_York").explanation  # EST is five hours
+    assert "is the wrong zone" in clock_trap(late, winter, "America/New_York").explanation  # EST is five hours
     hour = tuple(s + np.timedelta64(1, "h") for s in span)
     assert "daylight saving" in clock_trap(hour, span, "America/New_York").explanation
     assert clock_trap(span, span, "America/New_York") is None
@@ -85,4 +85,16 @@ def test_a_zone_without_an_offset_is_no_reason_for_hours():
     for zone in ("UTC", "Africa/Abidjan"):
         for late in (-HOUR, HOUR):
             trap = clock_trap((noon + late, noon + late + 600.0), span, zone)
-            assert trap.explanation == "one hour: daylight saving taken into account in one log only"
+            assert "radio times are" not in trap.explanation
+            assert trap.explanation.endswith("or daylight saving was taken into account in one log only")
+
+
+@pytest.mark.parametrize(("named", "offset_h", "saving"), [("America/Chicago", -5, True), ("Europe/Berlin", 2, False)])
+def test_a_wrong_zone_is_named_with_the_zone_that_fits(named, offset_h, saving):
+    """The radio log has local times of New York in summer (UTC-4), the telemetry has UTC."""
+    noon = 1_721_060_000.0
+    read = noon + (-4 - offset_h) * HOUR
+    trap = clock_trap((read, read + 600.0), (noon, noon + 600.0), named)
+    assert f"{named} (UTC{offset_h:+d}) is the wrong zone (UTC-4 fits the radio times" in trap.explanation
+    assert ("daylight saving" in trap.explanation) == saving
+    assert "timezone: ZONE" in trap.advice()

@@ -210,9 +210,10 @@ class GainModel:
         Standard deviation of the noise of a bin [dB].
     bin_s : float
         Duration over which samples are averaged [s].
-    campaigns : tuple of (str, float, float)
-        Name, ``own_sd_db`` and ``noise_sd_db`` of each campaign that has its own values. A fit uses those of campaigns.
-        Antennas with enough levels follow, for the error of a level: the shadowing differs between ports of a tower.
+    own_scales_db : tuple of (str, float, float)
+        ``own_sd_db`` and ``noise_sd_db`` of campaigns and of antennas (``tower.channel``) that have their own, after
+        the name of the campaign or antenna. A fit uses those of campaigns. The error of a level uses those of its
+        antenna, if it has enough levels: the shadowing differs between ports of a tower.
     """
 
     terms: tuple[Term, ...] = ANTENNA_TERMS
@@ -220,11 +221,11 @@ class GainModel:
     own_length_m: float = 20.0
     noise_sd_db: float = 1.5
     bin_s: float = 4.0
-    campaigns: tuple[tuple[str, float, float], ...] = ()
+    own_scales_db: tuple[tuple[str, float, float], ...] = ()
 
     def scales_db(self, *names: str) -> tuple[float, float]:
         """Return the standard deviations of nuisance and noise of the first name that has its own values [dB]."""
-        known = {name: (own, noise) for name, own, noise in self.campaigns}
+        known = {name: (own, noise) for name, own, noise in self.own_scales_db}
         return next((known[name] for name in names if name in known), (self.own_sd_db, self.noise_sd_db))
 
     def scaled(self, factor: float) -> GainModel:
@@ -234,7 +235,7 @@ class GainModel:
             terms=tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) for t in self.terms),
             own_sd_db=self.own_sd_db * factor,
             noise_sd_db=self.noise_sd_db * factor,
-            campaigns=tuple((name, own * factor, noise * factor) for name, own, noise in self.campaigns),
+            own_scales_db=tuple((name, own * factor, noise * factor) for name, own, noise in self.own_scales_db),
         )
 
 
@@ -587,7 +588,7 @@ _FEWEST_MEANS = 100
 def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
     """Return the model with the most likely scales per campaign and per antenna, if there are several campaigns."""
     names = list(dict.fromkeys(s.campaign for s in rows))
-    if len(names) == 1 or model.campaigns:
+    if len(names) == 1 or model.own_scales_db:
         return model
     # every second mean is enough to find the scales, and the Cholesky factor then takes an eighth of the time
     some = [s.part(np.arange(0, len(s), 2)) for s in rows]
@@ -595,7 +596,7 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
     parts = {name: [s for s in some if name in (s.campaign, s.antenna)] for name in every}
     determined = [name for name in every if name in names or sum(map(len, parts[name])) >= _FEWEST_MEANS]
     chosen = ((name, *_likeliest(_CAMPAIGN_SCALES_DB, parts[name], model.terms)) for name in determined)
-    return dataclasses.replace(model, campaigns=tuple(chosen))
+    return dataclasses.replace(model, own_scales_db=tuple(chosen))
 
 
 def _likeliest(

@@ -220,6 +220,8 @@ def _record_of(
         | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
         for name, m in calibration.learned.mounts.items()
     }
+    model = dataclasses.asdict(calibration.learned.model)
+    model["campaigns"] = model.pop("own_scales_db")  # the key in metrics.json, which scripts read
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
@@ -228,7 +230,7 @@ def _record_of(
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
         mounts=mounts,
-        strengths={"model": dataclasses.asdict(calibration.learned.model)},
+        strengths={"model": model},
         antennas=tuple(maps.values()),
         settings_text=text,
         stages_s=stages_s,

@@ -883,9 +883,10 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
         return column
     rest = [i for i in ranked if i != column]
     if not (texts == texts.shift()).any():
-        own = _instants(sheet, column, options)
+        some = sheet.part(np.arange(len(sheet)) % (1 + len(sheet) // 500) == 0)  # enough rows for a median
+        own = _instants(some, column, options)
         for i in rest if len(own) else ():
-            apart = _instants(sheet, i, options) - own
+            apart = _instants(some, i, options) - own
             if abs(apart_s := float(np.median(apart) / np.timedelta64(1, "s"))) > _APART_S:
                 text = f"{abs(apart_s):.0f} s {'behind' if apart_s < 0 else 'ahead of'} {sheet.names[column]!r}"
                 sheet.notes[i] = f"column {sheet.names[i]!r} is {text}, which is used: which clock is right?"

@@ -62,6 +62,7 @@ def test_scores_are_those_of_what_was_left_out(metrics: dict) -> None:
     assert unlisted("calibrate", metrics) == []
     assert {r["flight"] for r in metrics["scores"]["flight_left_out"]} == {"first", "second"}
     assert metrics["scores"]["campaign_left_out"] == []  # there is one
+    assert metrics["strengths"]["model"]["campaigns"] == []  # its scales are those of the model
     for split in set(SPLITS) - {"campaign_left_out"}:
         assert len(metrics["scores"][split]) == 2, split
         for row in metrics["scores"][split]:

@@ -43,7 +43,6 @@ SUMS = "SHA256SUMS"
 _SUMS_HEAD = "# aerpaw-cmp:"
 _SEAL = "# aerpaw-cmp wrote this file; SHA-256 of the lines below: "
 _UNFINISHED = ".unfinished"
-_Identity = tuple[int, int]
 
 
 # --- outputs of this tool --------------------------------------------------------------------------
@@ -133,7 +132,8 @@ def _digest(stream: BinaryIO) -> str:
 # --- inputs ---------------------------------------------------------------------------------------
 
 
-def _identity(path: Path) -> _Identity | None:
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return device and inode of a file, or None if there is no such file."""
     try:
         status = path.stat()
     except (OSError, ValueError):

@@ -41,7 +41,6 @@ from ..common.units import BoolArray, FloatArray, IntArray, wrap_degrees
 from .level import crps_normal
 
 Frame = Literal["body", "mast", "pair"]
-_Sharing = Literal["all", "antenna"]
 
 # Prior standard deviation of each offset in units of the noise: so large that the offset is practically free.
 _OFFSET_SD = 100.0
@@ -179,7 +178,7 @@ class Term:
     """
 
     frame: Frame
-    per: _Sharing
+    per: Literal["all", "antenna"]
     length: float
     sd_db: float
     tied: float = 0.9

@@ -39,9 +39,6 @@ from .tasks import code_digest
 # A function of one item that can be pickled.
 Task = Callable[[Any], Any]
 
-# The items of all tasks, by number.
-_Items = Sequence[Any]
-
 # A function that receives the number of an item and the result of its task, or :class:`Lost`.
 _OnResult = Callable[[int, Any], None]
 
@@ -68,15 +65,15 @@ class Workers(ABC):
         """The number of tasks that run at the same time."""
 
     @abstractmethod
-    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
+    def _run_waiting(self, task: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
         """Run waiting items by number until a worker ends. Return the numbers of the tasks that ended with it."""
 
-    def run(self, function: Task, items: _Items, on_result: _OnResult) -> None:
-        """Run a function on every item, in any order.
+    def run(self, task: Task, items: Sequence[Any], on_result: _OnResult) -> None:
+        """Run a task on every item, in any order.
 
         Parameters
         ----------
-        function : callable
+        task : callable
         items : sequence
         on_result : callable
             Receives the number and the result of each item once, in this process, as soon as the result is known.
@@ -91,8 +88,8 @@ class Workers(ABC):
         waiting = deque(range(len(items)))
         while waiting:
             # repeat tasks one at a time, so that a task that ends its worker does not end other tasks
-            for number in self._run_waiting(function, items, waiting, on_result):
-                if self._run_waiting(function, items, deque([number]), on_result):
+            for number in self._run_waiting(task, items, waiting, on_result):
+                if self._run_waiting(task, items, deque([number]), on_result):
                     on_result(number, _ENDED)
 
 
@@ -113,10 +110,10 @@ class InProcess(Workers):
 
     count = 1
 
-    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
+    def _run_waiting(self, task: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
         while waiting:
             number = waiting.popleft()
-            on_result(number, function(items[number]))
+            on_result(number, task(items[number]))
         return []
 
 
@@ -128,7 +125,7 @@ class Processes(Workers):
     def __init__(self, count: int) -> None:
         self.count = count
 
-    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
+    def _run_waiting(self, task: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
         active: dict[Future[Any], int] = {}
         others = multiprocessing.active_children()  # processes that the calling program started itself
         with _in_trusted_folder() as folder:
@@ -138,7 +135,7 @@ class Processes(Workers):
             while waiting or active:
                 while waiting and len(active) < self.count:
                     with _in_trusted_folder():
-                        future = pool.submit(function, items[waiting[0]])
+                        future = pool.submit(task, items[waiting[0]])
                     active[future] = waiting.popleft()
                 ready = wait_for(active, return_when=FIRST_COMPLETED).done
                 for future in sorted(ready, key=lambda f: isinstance(f.exception(), BrokenProcessPool)):
@@ -210,9 +207,9 @@ class Cluster(Workers):
         except OSError:
             raise self._scheduler_lost() from None
 
-    def _run_waiting(self, function: Task, items: _Items, waiting: deque[int], on_result: _OnResult) -> list[int]:
+    def _run_waiting(self, task: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
         killed: list[int] = []
-        active = {self._client.submit(function, items[number], pure=False): number for number in waiting}
+        active = {self._client.submit(task, items[number], pure=False): number for number in waiting}
         waiting.clear()
         while active:
             ready = [future for future in active if future.done()]

@@ -128,10 +128,7 @@ def typical_speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
     return float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= 3 else 0.0
 
 
-_Pairs = Callable[[IntArray, IntArray], BoolArray]
-
-
-def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> _Pairs:
+def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> Callable[[IntArray, IntArray], BoolArray]:
     """Return a function of two arrays of rows that returns the mask of pairs that no aircraft can reach in time.
 
     The limits are the speed of the fastest aircraft, and the speed of this aircraft around these rows plus the gain

@@ -19,9 +19,6 @@ from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows,
 
 from . import _sheet
 
-# Texts of each column, by its number.
-_Texts = Mapping[int, list[str]]
-
 # A column with more values than this counts something: it does not name devices or networks.
 _MOST_PARTS = 64
 # At a handover a program updates its columns one after the other. A value in at most this number of rows, and in at
@@ -94,7 +91,7 @@ def mostly_empty(sheet: _sheet.Sheet, column: int, where: BoolArray) -> str:
     return f"column {sheet.names[column]!r} {text}: are its cells merged, or written on changes only? If so, fill them"
 
 
-def _values(texts: _Texts) -> dict[int, set[str]]:
+def _values(texts: Mapping[int, list[str]]) -> dict[int, set[str]]:
     return {i: {*cells} - {""} for i, cells in texts.items()}
 
 
@@ -115,7 +112,7 @@ def _with_level(sheet: _sheet.Sheet) -> BoolArray:
     return filled if filled.any() else np.ones(len(sheet), dtype=bool)
 
 
-def dividing_columns(texts: _Texts, counts: BoolArray, base: Sequence[str] = ()) -> list[int]:
+def dividing_columns(texts: Mapping[int, list[str]], counts: BoolArray, base: Sequence[str] = ()) -> list[int]:
     """Return the columns, in order, that divide the rows further than the columns before them do.
 
     Parameters

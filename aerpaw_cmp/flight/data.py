@@ -378,7 +378,7 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
     if not path.is_file():
         raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
     options = log.options(timezone)
-    (file,) = ingest([path], options=options, reader=log.reader)
+    (file,) = ingest([path], options=options, reader=log.reader_name)
     for stream in at_height(log, file).result.streams:
         if stream.name in log.skip or not {"latitude_deg", "longitude_deg"} <= set(stream.frame.columns):
             continue
@@ -411,7 +411,8 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
         # report a missing log before the logs above it are read for minutes
         named_log(root, log.path)
     return tuple(
-        read_log(root, log.path, log.options(settings.timezone), reader=log.reader, held=cache) for log in settings.logs
+        read_log(root, log.path, log.options(settings.timezone), reader=log.reader_name, held=cache)
+        for log in settings.logs
     )
 
 

@@ -283,6 +283,11 @@ class LogSettings(StrictModel):
     skip: list[str] = []
     receiver: str = ""
 
+    @property
+    def reader_name(self) -> str | None:
+        """The name of the reader, or None if the content of the log shows it. ``columns`` belong to generic_csv."""
+        return self.reader or ("generic_csv" if self.columns else None)
+
     def options(self, timezone: str | None) -> ReadOptions:
         """Return the options of the log's reader. The default time zone is that of the flight."""
         return ReadOptions(

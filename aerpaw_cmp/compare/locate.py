@@ -544,7 +544,7 @@ class NodeEstimate:
     anywhere : float
         Log evidence of all positions within reach together.
     placed : bool
-        True if the levels fit a position within reach better than a position 30 km away.
+        True if the levels fit a position within reach better than a position 30 km away, and the UAV moved.
     at_edge : bool
         True if more than a few percent of the posterior are at the edge of the search, so that the node may be farther
         away.
@@ -617,7 +617,10 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
         slope=float(fits.slope[nearest]),
         slope_sd=float(fits.slope_sd[nearest]),
         anywhere=anywhere,
-        placed=bool(fits.evidence.max() - afar > _PLACED_ODDS),
+        # a hover that turns shows gains of the airframe, and no distance
+        placed=bool(
+            fits.evidence.max() - afar > _PLACED_ODDS and np.ptp(track.position_m, axis=0).max() > SYSTEMATIC_M
+        ),
         at_edge=bool(share[_on_edge(places, grid, spacing)].sum() > _LEAST_SHARE),
         regions=regions,
     )

@@ -1,5 +1,6 @@
 """The place of a node by its levels: the evidence computed in a second way, and regions over simulated flights."""
 
+import dataclasses
 import tracemalloc
 from collections.abc import Iterator
 from time import process_time
@@ -256,6 +257,17 @@ def test_levels_that_do_not_fall_with_the_distance_place_no_node() -> None:
         (4.0 * position, np.full(75, -60.0), False), (0.0 * position + 30.0, noise, False),
     ):  # fmt: skip
         assert locate(level_track(2.0 * time, way, level)).placed == placed
+
+
+def test_a_hover_that_turns_places_no_node() -> None:
+    """The level does not change with the heading, so the model prefers a node directly below."""
+    time = 4.0 * np.arange(80)
+    level = np.random.default_rng(4).normal(-80.0, 1.0, 80)
+    cos, sin = np.cos(time / 40.0), np.sin(time / 40.0)
+    turned = np.moveaxis(np.array([[cos, -sin, 0 * cos], [sin, cos, 0 * cos], [0 * cos, 0 * cos, 1 + 0 * cos]]), -1, 0)
+    for moved_m, placed in ((1.0, False), (30.0, True)):
+        way = np.column_stack([np.linspace(0.0, moved_m, 80), np.zeros(80), np.full(80, 30.0)])
+        assert locate(dataclasses.replace(level_track(time, way, level), rotation=turned)).placed == placed
 
 
 def test_regions_of_one_place_are_the_disks_of_a_normal_distribution() -> None:

@@ -409,12 +409,14 @@ class _Check:
                 )
 
     def _within_ports(self) -> None:
-        """Flag ranks above the number of ports in the log."""
+        """Flag ranks above the number of ports in the log, or above the four ports whose ranks are compared."""
         ports, rank = self._about.get("ports"), self._values("rank")
-        if not isinstance(ports, (int, float)) or isinstance(ports, bool) or not (bad := rank > float(ports)).any():
-            return
-        why = f"but the log has at most {ports:g} ports (a wrong base of the indicator, or another cell?)"
-        self._flag(bad, "rank_above_ports", f"rank {rank[int(np.argmax(bad))]:g}", why, ["rank"])
+        whose = "the log has"
+        if not isinstance(ports, (int, float)) or isinstance(ports, bool):
+            ports, whose = 4, "ranks are compared for"
+        if (bad := rank > float(ports)).any():
+            why = f"but {whose} at most {ports:g} ports (a wrong base of the indicator, or another cell?)"
+            self._flag(bad, "rank_above_ports", f"rank {rank[int(np.argmax(bad))]:g}", why, ["rank"])
 
     def _no_index(self) -> None:
         """Flag levels that mostly cannot be received: an index of the standard (0 .. 127), another unit, or a ratio."""

@@ -70,18 +70,6 @@ def _starts_near(origin: str, file: IngestedFile) -> bool:
     return not times or bool(np.min([abs(time - zero) for time in times]) < _NEAR_ORIGIN)
 
 
-def idle_settings(settings: FlightFile, kinds: Collection[str]) -> list[str]:
-    """Return warnings about settings that have no effect, one per reason.
-
-    Parameters
-    ----------
-    settings : FlightFile
-    kinds : collection of {"rss", "rank"}
-        Kinds of measurements in the logs.
-    """
-    return _without_effect(settings, _reasons(settings, kinds))
-
-
 def _without_effect(model: BaseModel, reasons: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
     """Return a sentence per reason about the dotted keys that the user changed."""
     changed = ((why, [key for key in keys if _differs(model, key)]) for why, keys in reasons)
@@ -91,7 +79,7 @@ def _without_effect(model: BaseModel, reasons: Iterable[tuple[str, Sequence[str]
 
 
 def _reasons(settings: FlightFile, kinds: Collection[str]) -> Iterator[tuple[str, Sequence[str]]]:
-    """Yield each reason with the dotted keys that have no effect because of it."""
+    """Yield each reason, and the dotted keys without effect, for logs of these kinds ("rss", "rank")."""
     rt, lag = settings.rt, settings.rss.lag
     if rt.foliage != "attenuating":
         losses = ["rt.leaves", "rt.advanced.gamma_db_per_m", "rt.advanced.maximum_loss_db"]
@@ -507,7 +495,7 @@ def gather(
     rss, rank, warnings = found.rss, found.rank, found.warnings
     if found.void and not rss and not rank:
         raise found.void[0]
-    warnings += idle_settings(settings, {*(["rss"] if rss else []), *(["rank"] if rank else [])})
+    warnings += _without_effect(settings, _reasons(settings, {*(["rss"] if rss else []), *(["rank"] if rank else [])}))
     if settings.rank.tower not in {RankSettings().tower, *(series.tower for _, series in rank)}:
         warnings.append("rank.tower has no effect: no log has ranks without its own 'node'")
     if rank and settings.link.rank.bandwidth_hz is None:

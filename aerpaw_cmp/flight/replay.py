@@ -386,10 +386,8 @@ def replay_rank(data: FlightData, progress: Progress = logged) -> list[Replayed]
     for series in data.rank:
         link = data.link_of(series)
         if min(len(link.uav_array), len(link.tower_arrays[series.tower])) > MAX_RANK:
-            raise UsageError(
-                f"link.rank of {series.tower} has more than {MAX_RANK} elements at both ends",
-                expected=f"at most {MAX_RANK} elements at one end, because modems report ranks up to {MAX_RANK}",
-            )
+            found = f"link.rank of {series.tower} has more than {MAX_RANK} elements at both ends"
+            raise UsageError(found, expected=f"at most {MAX_RANK} at one end, because modems report no higher rank")
         poses, valid, track = rank_poses(data, series)
         towers_m = data.tower_at(series.tower, series.time)[0][valid] if series.tower in data.nodes else None
         progress(f"replay rank {series.tower}: {counted(len(poses), 'pose')}")

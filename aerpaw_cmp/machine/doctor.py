@@ -66,7 +66,7 @@ def checks() -> list[Check]:
         *package_checks(),
         *compilers,
         gpu,
-        _cores_check(),
+        Check("CPU", "ok", f"{counted(thread_count(), 'core')}, {platform.machine()}"),
         memory_check(),
         _disk_check(Path.cwd()),
         cache_check(cache_folder()),
@@ -142,11 +142,6 @@ def _gpu_check() -> Check:
         return Check("GPU", "ok", "tested: Sionna RT uses cuda_ad_mono_polarized")
     remedy = "update the NVIDIA driver ('nvidia-smi' must list the GPU); Sionna RT uses LLVM until then"
     return Check("GPU", "warn", f"an NVIDIA driver is installed, but {trial.reason}", remedy)
-
-
-def _cores_check() -> Check:
-    """Report the number of processor cores that this process may use."""
-    return Check("CPU", "ok", f"{counted(thread_count(), 'core')}, {platform.machine()}")
 
 
 def available_memory_bytes(root: Path = Path("/")) -> int | None:

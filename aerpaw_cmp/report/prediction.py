@@ -196,13 +196,9 @@ def _stated(correction: Correction) -> str:
     """Return the sentence and next step about the stated standard deviations on held-out data."""
     error, sd = correction.held_out[correction.base, correction.title]
     verdict = stated_errors(error, sd, place_m=correction.held_out_place_m)
-    return said_of(verdict, STATED, inside=100.0 * _inside_share(error, sd))
-
-
-def _inside_share(error: FloatArray, sd: FloatArray) -> float:
-    """Return the share of errors inside their 90 % interval."""
-    good = np.isfinite(error)
-    return float(np.mean(np.abs(error[good]) <= 1.6449 * sd[good])) if good.any() else float("nan")
+    known = np.isfinite(error)
+    inside = np.abs(error[known]) <= 1.6449 * sd[known]  # their 90 % intervals
+    return said_of(verdict, STATED, inside=100.0 * float(inside.mean()) if known.any() else float("nan"))
 
 
 def _against_free_space(correction: Correction) -> Verdict:

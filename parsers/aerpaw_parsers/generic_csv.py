@@ -202,7 +202,10 @@ def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
     """Yield index, separator and names of each line that may be the header, starting at ``first``."""
     for i in range(first, min(first + _sheet.TITLES, len(lines))):
         line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
-        separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
+        # names may have spaces, so these separate only if nothing else does
+        *marks, wide, narrow = (sign.encode() for sign in _sheet.SEPARATORS)
+        known = max(marks, key=line.count)
+        separator = (known if known in line else wide if wide in line else narrow).decode()
         yield i, separator, [name.strip() for name in _sheet.split_row(line, separator)]
 
 

@@ -113,10 +113,10 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     best = max(odds, key=lambda some: odds[some])
     alternatives = _alternatives(best, odds, _MARGIN + math.log(max(len(channels), 1)))
     beside = certain = frozenset().union(*(either for either in alternatives if len(either) == 1))
+    named = dict[frozenset[str], list[_Models]]()
     for _ in range(2):
-        named = dict[frozenset[str], list[_Models]]()
         for either in alternatives:
-            if any(either < pair for pair in named):
+            if any(either <= pair for pair in named):
                 continue
             name = max(either & best)
             # the UAV has one height and one attitude, and a tower one place, so all their channels must show the error
@@ -129,7 +129,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             shown.sort(key=lambda table: -_best(table, {name}).gain)
             if all(_explains(other, shown, _lead(either, odds) / len(shown), beside - either) for other in either):
                 named[either] = shown
-        # a cause that may not be named takes no credit for a part of the error
+        # in the second pass, a cause that may not be named takes no credit for a part of the error
         beside = certain & frozenset().union(*named)
     # an almost certain cause that may not be named shows that no explanation fits
     if any(_lead({other}, odds) >= _CERTAIN for other in certain - frozenset().union(*named)):
@@ -464,9 +464,8 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
     channels = tuple(model.evidence.name for model in alone)
     where = channels[0] if len(channels) == 1 else f"{len(channels)} channels"
     others = [shown[0][frozenset([other])].trials[0].sentence for other in names[1:]]
-    value, low, high = trial.estimate
     return Cause(
-        name=" or ".join(names), channels=channels, estimate=value, ci95=(low, high),
+        name=" or ".join(names), channels=channels, estimate=trial.estimate[0], ci95=trial.estimate[1:],
         sentence=f"Likely cause at {where}: {', or '.join([trial.sentence, *others])}; "
         f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
         next_step=trial.next_step, rmse_db=rmse, rmse_with_db=rmse_with, gain=gain,

@@ -1170,6 +1170,10 @@ def pass_pairs(
         A sample of the first pass is paired with the nearest sample of the second pass within this distance.
     heading_within_deg : float, optional
         Largest difference of the headings of a pair, if both passes have headings. None allows any heading.
+
+    Returns
+    -------
+    list of PassPair
     """
     places: dict[bytes, _Places] = {}
     # by flight, then by link

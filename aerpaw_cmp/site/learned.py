@@ -681,7 +681,7 @@ def find_named(name: str, folder: Path, end: str = "") -> Named:
     raise UnknownName(
         f"no learned model is called {name!r}" + (f" for {_WANTED[end]}" if end else ""),
         expected="one of " + ", ".join(fitting) if fitting else "SITE/ENTRY of a site with learned models",
-        cause=None if fitting else f"there is no such learned model in {folder_of(place)}",
+        cause=None if fitting else f"no models in {folder_of(place)}: SITE is relative to the flight file (../my_site)",
     )
 
 

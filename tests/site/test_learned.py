@@ -114,7 +114,7 @@ def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
         ),
         ({"uav": "mine/d12_LW1.A"}, "expected one of mine/d12_uav"),
         ({"LW1.A": "mine/d12_uav"}, "expected one of mine/d12_LW1.A"),
-        ({"uav": "other/d12_uav"}, "there is no such learned model in .*other.learned"),
+        ({"uav": "other/d12_uav"}, "no models in .*other.learned: SITE is relative to the flight file"),
         ({"uav1": "mine/d12_uav"}, "unknown key 'antennas.uav1'; expected 'uav' or 'TOWER.CHANNEL'"),
     ],
 )

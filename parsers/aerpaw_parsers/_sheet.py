@@ -427,7 +427,9 @@ class Sheet:
         words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
         if words:
             shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
-            text = "If one names the cell or device of a row, call it 'cell' or 'device', or use --map NAME=cell"
+            text = (
+                "If one names the cell or device of a row, call it 'cell' or 'device' (next to other --map: NAME=cell)"
+            )
             said.append(f"not read: {shown}. {text}")
         gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         if gains:

@@ -80,6 +80,8 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
 
 def _is_even(lines: Sequence[bytes], separator: str) -> bool:
     """Check whether most lines below a header of columns between spaces have as many fields as the header."""
+    if b": " in lines[0]:  # keys and values, such as those of YAML
+        return False
     width, *below = [len(split_row(line, separator)) for line in lines[:6] if line.strip()] or [0]
     # R and pandas write no name above the numbers of rows
     return 2 * max(below.count(width), below.count(width + 1)) > len(below) and max(below) <= width + 1

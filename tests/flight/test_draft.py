@@ -93,7 +93,7 @@ def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
     assert line.endswith("is it UTC?")
     late, other = sorted(remark for remark in remarks if remark.startswith("left out: "))
     assert "LW2/USRP1_power_log.txt" in late
-    assert "one hour: daylight saving" in late
+    assert "daylight saving was taken into account in one log only" in late
     assert "later_power_log.txt: LW3/USRP1_power_log.txt has" in other
     assert any("samples can be compared" in remark for remark in remarks)
     settings = parse_yaml(text, FlightFile)

@@ -207,6 +207,8 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         table("time,pci,rsrp", EPOCH + ',5,"[{l}, -99]"'), InputError, "found no record"),
     "a local position of PX4": (
         table("timestamp,x,y,z,ref_lat,ref_lon", "9123456{i},0.0,0.0,0.0,35.72751,-78.69604"), InputError, "positions on a grid"),
+    "a plan in YAML, whose lines have equally many words": (
+        (Path(__file__).parents[2] / "sample_logs/flight.yaml").read_text(), InputError, "settings of a flight"),
 }  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.flight.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
+from aerpaw_cmp.compare.result import CANNOT_TELL, SHIFTED
+from aerpaw_cmp.flight.clock import ClockEstimate, judge_clock
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
 from aerpaw_cmp.flight.gains import load_with_learned

@@ -41,6 +41,9 @@ BASELINE_TITLE = {
     "constant": "constant level",
 }
 
+# Verdicts on a clock.
+OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
+
 # States of a clock: corrected by the estimate, not corrected although requested, only estimated, or corrected by a
 # value of the flight file.
 APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
@@ -68,7 +71,7 @@ class ClockResult:
     @property
     def shifted(self) -> bool:
         """True if the clock is wrong and was not corrected."""
-        return self.verdict == "shifted" and self.applied != APPLIED
+        return self.verdict == SHIFTED and self.applied != APPLIED
 
     @property
     def in_words(self) -> str:

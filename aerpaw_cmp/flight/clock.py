@@ -26,13 +26,10 @@ from ..common.geodesy import rough_m
 from ..common.jsonable import fields_of
 from ..common.units import AnyArray, BoolArray, FloatArray, Printed
 from ..compare.evidence import ages
-from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
+from ..compare.result import APPLIED, CANNOT_TELL, ESTIMATED, NOT_APPLIED, OK, SHIFTED, ClockResult
 from ..compare.statistics import is_flat
 from ..logs.records import Stream, has_wall_clock
 from .track import interpolated, nanoseconds
-
-# Verdicts.
-OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
 
 # A lag is excluded if its log likelihood is below the maximum by more than this value [nat].
 EVIDENCE_NAT = 4.0

@@ -126,8 +126,8 @@ class PathTable:
 
     @property
     def most(self) -> int:
-        """Largest number of paths of a link, at least 1."""
-        return int(self.number.max(initial=0)) + 1
+        """Largest number of paths of a link."""
+        return int(self.number.max(initial=-1)) + 1
 
     @property
     def delay_s(self) -> FloatArray:

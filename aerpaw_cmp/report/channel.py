@@ -307,7 +307,8 @@ def _write_npz(channel: Channel, folder: Path) -> Path:
 def _write_csv(channel: Channel, folder: Path) -> Path:
     """Write one row per time and tower: level of the link, and delay and Doppler shift of its strongest path."""
     path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.replay.has_path.shape
-    strongest = channel.by_link((np.abs(table.gain) ** 2).mean(axis=(1, 2)), -1.0).argmax(axis=0)
+    power = channel.by_link((np.abs(table.gain) ** 2).mean(axis=(1, 2)), -1.0)
+    strongest = power.argmax(axis=0) if table.most else np.zeros((poses, towers), dtype=np.int64)
     time: AnyArray = channel.along.time_s
     if channel.along.start is not None:
         instants = channel.along.start + np.round(channel.along.time_s * 1e9).astype("timedelta64[ns]")
@@ -316,7 +317,7 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     shown: dict[str, Any] = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
     shown["gain_db"] = gain_db.ravel().round(3)
     for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
-        each = channel.by_link(values)
+        each = channel.by_link(values) if table.most else None
         shown[name] = np.nan if each is None else np.take_along_axis(each, strongest[None], axis=0).ravel()
     # the first part creates the file, and later parts are appended
     guarded(pd.DataFrame(shown)).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")

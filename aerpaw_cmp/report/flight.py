@@ -20,9 +20,17 @@ from ..common.text import counted
 from ..common.units import AnyArray, FloatArray
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.referee import AVERAGED, OURS
-from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
+from ..compare.result import (
+    APPLIED,
+    CANNOT_TELL,
+    GIVEN,
+    AuditResult,
+    ClockResult,
+    EngineResult,
+    RankResult,
+    RssResult,
+)
 from ..compare.statistics import Interval
-from ..flight.clock import CANNOT_TELL
 from ..logs.records import has_wall_clock
 from . import flight_words as words
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, paragraph, settings_card

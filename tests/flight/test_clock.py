@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from aerpaw_cmp.compare.result import CANNOT_TELL, OK, SHIFTED
 from aerpaw_cmp.flight import replay as flight_replay
 from aerpaw_cmp.flight.clock import (
-    CANNOT_TELL,
     EVIDENCE_NAT,
-    OK,
-    SHIFTED,
     STAMPS_S,
     Along,
     ClockChannel,

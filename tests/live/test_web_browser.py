@@ -161,8 +161,8 @@ def test_measured_and_predicted_stand_beside_each_other(driver, fly):
     card = text(driver, "modems")
     for words in ("Predicted rank3 (2–4)outside", "−7.0 dBoutside", "RSRP−99 dBm", "SINR12 dB"):
         assert words in card
-    assert text(driver, "rank-words").endswith("90 % interval holds 90 % of 10")
-    assert text(driver, "rsrp-words").endswith("90 % interval holds 85 % of 20")
+    assert text(driver, "rank-words").endswith("inside the 90 % interval: 90 % of 10")
+    assert text(driver, "rsrp-words").endswith("inside the 90 % interval: 85 % of 20")
     assert driver.execute_script("return document.querySelector('#modems .big').textContent") == "1"
     assert "<b>made up</b>" in text(driver, "modems") + driver.find_element("tag name", "h1").text
     flight.fly(1, rank=2, rsrp=-91.0)

@@ -112,23 +112,16 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         odds[used] = sum(model.gain for model in models) - _SELDOM * len(used) - _unpaid(models)
     best = max(odds, key=lambda some: odds[some])
     alternatives = _alternatives(best, odds, _MARGIN + math.log(max(len(channels), 1)))
+    shown = {either: _channels_showing(either, best, tables) for either in alternatives}
     beside = certain = frozenset().union(*(either for either in alternatives if len(either) == 1))
     named = dict[frozenset[str], list[_Models]]()
     for _ in range(2):
-        for either in alternatives:
+        for either, showing in shown.items():
             if any(either <= pair for pair in named):
                 continue
-            name = max(either & best)
-            # the UAV has one height and one attitude, and a tower one place, so all their channels must show the error
-            of_all = all(_conditions(each).of_uav for each in either)
-            shown = [table for table in tables if of_all or name in _names(_best(table, best))]
-            if any(_conditions(each).of_tower for each in either):
-                towers = {table[_SOUND].evidence.tower for table in shown}
-                shown = [table for table in tables if table[_SOUND].evidence.tower in towers]
-            # the sentence quotes the channel that shows the cause most clearly
-            shown.sort(key=lambda table: -_best(table, {name}).gain)
-            if all(_explains(other, shown, _lead(either, odds) / len(shown), beside - either) for other in either):
-                named[either] = shown
+            lead = _lead(either, odds) / len(showing)
+            if all(_explains(other, showing, lead, beside - either) for other in either):
+                named[either] = showing
         # in the second pass, a cause that may not be named takes no credit for a part of the error
         beside = certain & frozenset().union(*named)
     # an almost certain cause that may not be named shows that no explanation fits
@@ -140,6 +133,19 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     either = min(named, key=lambda e: (CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
     cause = _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
+
+
+def _channels_showing(either: Set[str], best: Set[str], tables: Sequence[_Models]) -> list[_Models]:
+    """Return the channels that must show a cause (or one of two causes), the clearest first."""
+    name = max(either & best)
+    # the UAV has one height and one attitude, and a tower one place, so all their channels must show the error
+    of_all = all(_conditions(each).of_uav for each in either)
+    shown = [table for table in tables if of_all or name in _names(_best(table, best))]
+    if any(_conditions(each).of_tower for each in either):
+        towers = {table[_SOUND].evidence.tower for table in shown}
+        shown = [table for table in tables if table[_SOUND].evidence.tower in towers]
+    # the sentence quotes the channel that shows the cause most clearly
+    return sorted(shown, key=lambda table: -_best(table, {name}).gain)
 
 
 def _unpaid(models: Sequence[_Model]) -> float:

@@ -186,7 +186,8 @@ _OF_LONG_TABLES = ("rss", "kpi", "rank", "position", "height")
 def _refuse_other_numbers(sheet: _sheet.Sheet, column: int, options: ReadOptions) -> None:
     """Refuse powers without a unit as levels, and rows of several quantities that another column names."""
     for i in range(len(sheet.names)):
-        named = sorted({*sheet.texts(i)}) if _identity.few(sheet.texts(i)) else []
+        texts = {*sheet.texts(i)}
+        named = sorted(texts) if _identity.few(texts) else []
         known = [text for text in named if (m := dictionary.meaning(text)) and m.quantity.role in _OF_LONG_TABLES]
         if len(known) > 1:
             found = f"column {sheet.names[i]!r} names the quantity of each row: {', '.join(known[:4])}"

@@ -172,7 +172,8 @@ def peers(history: list[dict[str, Any]]) -> list[str]:
     out = [
         "## Against peers",
         "",
-        "Both programs run in one process. The table has the ratio of processor times: above 1, this tool is faster.",
+        "Each row compares this tool with another program in one process, by the ratio of processor times. Above 1, "
+        "this tool is faster.",
         SEARCH_NOTE,
         "",
         head,
@@ -211,9 +212,10 @@ def town(history: list[dict[str, Any]]) -> list[str]:
     if not rows:
         return []
     out = [
-        f"Munich of Sionna RT ({number(rows[0]['faces'])} faces, {rows[0]['receivers']} receivers, one tower; {when}); "
-        "PathSolver's time includes kernels that are missing in its cache:", "",
-        "| search | depth | processor s | times ours | missing paths |", "| --- | ---: | ---: | ---: | ---: |",
+        f"Sionna RT's scene of Munich ({number(rows[0]['faces'])} faces, {rows[0]['receivers']} receivers, one tower; "
+        f"{when}). PathSolver's time includes the compilation of kernels that are not in its cache:", "",
+        "| search | depth | processor s | relative to the image engine | missing paths |",
+        "| --- | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for row in rows:
         cpu = row["search_s"][1]
@@ -223,8 +225,8 @@ def town(history: list[dict[str, Any]]) -> list[str]:
         out.append(f"| {name} | {row['depth']} | {number(cpu)} | {ratio} | {lacks} |")
     if str(when) < "2026-11-29":
         out += [
-            "", "From 2026-11-29 on, the search also follows first faces that another face hides: 1.85 s at depth 2 "
-            "and 60.1 s at depth 3 on a machine under load. It finds the same paths with less code.",
+            "", "From 2026-11-29 on, the search also follows first faces that another face hides. It finds the same "
+            "paths with less code, in 1.85 s at depth 2 and 60.1 s at depth 3 (on a machine with other work).",
         ]  # fmt: skip
     return [*out, ""]
 
@@ -274,8 +276,8 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
     sizes = {f"{number(n)}": str(n) for n in counts} | {f"{number(counts[-1])}, first call of a process": "first"}
     return [
         f"Kriging of one field, 20 neighbours ({when}), processor seconds, the least of five runs in alternation. "
-        "Totals include the set-up of each program, and the first call of a process also its imports. The last row "
-        "includes neither set-up nor imports:",
+        "Totals include the set-up of each program. The first call of a process also includes its imports, and the "
+        "last row includes neither:",
         "",
         "| targets | ours | PyKrige's C back end | times faster |",
         "| ---: | ---: | ---: | ---: |",
@@ -288,8 +290,8 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
         "", f"27 fields at {number(counts[0])} targets: {row[f'ratio_total_{counts[0]}_27_fields']:.0f} "
         "times faster than 27 runs of PyKrige.", "",
         "From 2026-11-29 on, semivariances are computed for each target, also if it shares samples with its "
-        "neighbours: 100 000 scattered targets take 0.83 s instead of 0.48 s on a machine under load, and maps on a "
-        "grid as long as before.", "",
+        "neighbours. On a machine with other work, 100 000 scattered targets then take 0.83 s instead of 0.48 s. The "
+        "time of maps on a grid does not change.", "",
     ]  # fmt: skip
 
 
@@ -312,11 +314,12 @@ def reports(run: dict[str, Any]) -> list[str]:
     short = result["two_channels"]
     return [
         "## A report", "",
-        f"Processor time of the process for two channels ({short['flight']}). It is compared with "
-        f"`import sionna.rt, matplotlib.pyplot, pandas`, and with these imports without Sionna (medians"
-        f"{imports_of(short)}). For the first report all caches on the disk are empty (kernels, paths, fonts, LLVM "
+        f"Processor time of a report of two channels ({short['flight']}). The table also compares it with the time of "
+        f"`import sionna.rt, matplotlib.pyplot, pandas` alone, and of these imports without Sionna (medians"
+        f"{imports_of(short)}). For the first report, all caches on the disk are empty (kernels, paths, fonts, LLVM "
         "test):", "",
-        "| | seconds | x imports | x imports without Sionna | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
+        "| | seconds | times the imports | times the imports without Sionna | peak MiB |",
+        "| --- | ---: | ---: | ---: | ---: |",
         *(
             f"| {name} | {row['cpu_s']:.1f} | {row['ratio']:.2f} | {row['ratio_light']:.2f} | {row['peak_mib']:.0f} |"
             for name, row in rows
@@ -332,8 +335,8 @@ def waits(run: dict[str, Any]) -> list[str]:
         return []
     return [
         "## Commands", "",
-        "Complete processes in processor seconds, after a first run. \"Before\" is an earlier version:", "",
-        "| command | before | goal | now | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
+        "Processor time of complete processes whose caches were filled by an earlier run:", "",
+        "| command | an earlier version [s] | goal [s] | now [s] | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
         *(
             f"| {row['command']} | {row['before_s']:g} | {row['asked_s']:g} | {row['cpu_s']:.1f} | "
             f"{row['peak_mib']:.0f} |"
@@ -354,8 +357,8 @@ def page(history: list[dict[str, Any]]) -> str:
         "```", "aerpaw-cmp bench      # speed against error of the replay, about a minute", "```", "",
         "`make bench-all` makes this page: `python benchmarks/all.py` measures and appends to",
         "`benchmarks/history.jsonl`, and `python benchmarks/performance.py` writes the page from it. The numbers come",
-        "from one run on one machine. Processor seconds count all threads and processes. They increase with other work",
-        "on the machine, so the load is given.", "",
+        "from one run on one machine. Processor seconds are summed over all threads and processes. Other work on the",
+        "machine increases them, so the load (the average number of running processes) is stated, too.", "",
         f"Last run: {run['date']}, version {run['version']}, {machine['processor']}, {machine['cpus']} processors, "
         f"{machine['memory_gib']} GiB, {machine['system']}, Python {machine['python']}; load {run['load_before']} "
         f"before, {run.get('load_after', '-')} after (the run causes 1 to 2), {run['seconds'] / 60:.1f} min in "

@@ -1,8 +1,7 @@
 """The files rss.nc and rank.nc of a report: the samples of rss.csv and rank.csv with units and the names of links.
 
-The layout is the contiguous ragged array of trajectories of the CF conventions (1.11, section H.4.3): the samples of
-all links follow each other along ``obs``, and ``row_size`` is their number per link. Variables are those of
-:mod:`.columns`, and a missing number is NaN.
+Dimensions are the names of :data:`_AXES` and ``obs``, the number of a sample in its series. Series that are shorter
+than the longest one end with NaN. Variables are those of :mod:`.columns`, and a missing number is NaN.
 """
 
 from __future__ import annotations
@@ -19,8 +18,9 @@ from ..logs.records import has_wall_clock
 from .columns import DECIMALS, RANK, RSS, Column, tables
 from .flight_data import ReportData
 
-# Columns of text, which are the same for all samples of a link.
-_LINK = ("tower", "channel", "unit")
+# Columns of text: labels that select a series, and its unit.
+_AXES = ("tower", "channel")
+_TEXTS = (*_AXES, "unit")
 _TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}
 _RANKS = flags(("no path", "rank 1", "rank 2", "rank 3", "rank 4"))
 
@@ -44,35 +44,45 @@ def write_netcdf(data: ReportData, folder: Path) -> list[Path]:
 
 
 def _dataset(data: ReportData, kind: str, columns: Sequence[Column], series: Sequence[Any]) -> Dataset:
-    """Return the samples of all links as variables with the dimensions ``trajectory`` (links) and ``obs`` (samples)."""
-    members, links = tables(columns, series)
-    texts = [column for column in members if column.name in _LINK]
-    variables: dict[str, Any] = {
-        column.name: ("trajectory", [str(row[column.name]) for _, row in links], {"long_name": column.meaning})
-        for column in texts
-    }
-    names = [" ".join(str(row[column.name]) for column in texts[:2]) for _, row in links]
-    variables["link"] = ("trajectory", names, {"long_name": "name of the link", "cf_role": "trajectory_id"})
-    about = {"long_name": "number of samples of this link", "sample_dimension": "obs"}
-    variables["row_size"] = ("trajectory", np.array([len(time) for time, _ in links], dtype=np.int32), about)
-    variables["time"] = ("obs", *_seconds(np.concatenate([time for time, _ in links])))
+    """Return the samples of all series as variables with the dimensions :data:`_AXES` and ``obs``."""
+    members, rows = tables(columns, series)
+    texts = {column: [str(row[column.name]) for _, row in rows] for column in members if column.name in _TEXTS}
+    labels = {column: list(dict.fromkeys(names)) for column, names in texts.items() if column.name in _AXES}
+    counts = [len(names) for names in labels.values()]
+    cells = np.ravel_multi_index([[labels[c].index(n) for n in texts[c]] for c in labels], counts)
+    lengths = np.array([len(time) for time, _ in rows])
+    places = np.concatenate([cell * lengths.max() + np.arange(n) for cell, n in zip(cells, lengths, strict=True)])
+    axes = tuple(column.name for column in labels)
+
+    def placed(values: FloatArray) -> tuple[tuple[str, ...], FloatArray]:
+        """Return dimensions and values of a variable, from the values of all series one after another."""
+        whole = np.full((*counts, lengths.max()), np.nan)
+        whole.flat[places] = values
+        return (*axes, "obs"), whole
+
+    variables: dict[str, Any] = {c.name: (c.name, names, {"long_name": c.meaning}) for c, names in labels.items()}
+    for column in texts.keys() - labels.keys():
+        units = np.full(counts, "", dtype=object)
+        units.flat[cells] = texts[column]
+        variables[column.name] = (axes, units, {"long_name": column.meaning})
+    seconds, about = _seconds(np.concatenate([time for time, _ in rows]))
+    variables["time"] = (*placed(seconds), about)
     samples = {
-        column.name: np.concatenate([_numbers(row[column.name]) for _, row in links])
+        column.name: np.concatenate([_numbers(row[column.name]) for _, row in rows])
         for column in members
-        if column.name not in _LINK
+        if column not in texts
     }
-    axes = (("latitude", "degrees_north"), ("longitude", "degrees_east"))
-    for (name, unit), values in zip(axes, _degrees(data, samples), strict=True):
-        variables[name] = ("obs", values, {"standard_name": name, "long_name": f"WGS84 {name}", "units": unit})
+    degrees = (("latitude", "degrees_north"), ("longitude", "degrees_east"))
+    for (name, unit), values in zip(degrees, _degrees(data, samples), strict=True):
+        variables[name] = (*placed(values), {"standard_name": name, "long_name": f"WGS84 {name}", "units": unit})
     variables["crs"] = ((), np.int32(0), wgs84())
     for column in members:
         if column.name in samples:
-            name = column.name.replace(".", "p")
-            variables[name] = ("obs", samples[column.name], _attributes(column))
+            variables[column.name.replace(".", "p")] = (*placed(samples[column.name]), _attributes(column))
     source = "synthetic logs, replayed by ray tracing" if data.synthetic else "field logs, replayed by ray tracing"
     comment = "Heights (up_m) are metres above the ground at the site origin. A missing number is NaN."
     attributes = file_attributes(title=f"{_TITLES[kind]}: {data.title}", source=source, comment=comment)
-    return Dataset(variables, {**attributes, "featureType": "trajectory"})
+    return Dataset(variables, attributes)
 
 
 def _numbers(values: Any) -> FloatArray:

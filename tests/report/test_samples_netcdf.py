@@ -36,8 +36,8 @@ def every(record, step, **change):
 
 @pytest.fixture(scope="module")
 def data(report_data):
-    """A short flight with an unknown position, a name in Latin-1, and a rank without CSI."""
-    first, last = every(report_data.rss[0], 60), every(report_data.rss[2], 60, tower='LW<4> "ö"')
+    """Two series of different length with an unknown position, a name in Latin-1, and a rank without CSI."""
+    first, last = every(report_data.rss[0], 60), every(report_data.rss[2], 70, tower='LW<4> "ö"')
     place = np.array(first.position_m)
     place[7] = np.nan
     rank = dataclasses.replace(every(report_data.rank[0], 10), level_dbm=np.linspace(-90, -50, 100))
@@ -53,16 +53,23 @@ def test_a_file_has_the_samples_of_its_table(data, tmp_path, cf_faults, kind, co
     numbers = [name for name in table.select_dtypes("number") if name != "time_s"]
     assert len(numbers) > 6
     with xarray.open_dataset(tmp_path / f"{kind}.nc", decode_coords="all") as book:
-        for name in numbers:
-            np.testing.assert_allclose(book[name.replace(".", "p")], table[name], atol=1e-9, err_msg=name)
-        times = pd.to_datetime(table["time_utc"]).dt.tz_localize(None).to_numpy()
-        assert np.abs(book["time"].values - times).max() <= np.timedelta64(1, "ms")
-        towers = np.repeat(book["tower"].values.astype(str), book["row_size"].values)
-        assert towers.tolist() == table["tower"].tolist()
-        known = table["east_m"].notna().to_numpy()
-        assert np.isfinite(book["latitude"].values).tolist() == known.tolist()
-        places = data.site.frame.to_local(book["latitude"].values[known], book["longitude"].values[known])
-        np.testing.assert_allclose(places[0], table["east_m"][known], atol=2e-3)
+        labels = [name for name in ("tower", "channel") if name in table]
+        parts = {key: part.reset_index() for key, part in table.groupby(labels)}
+        assert len(parts) == len(getattr(data, kind))
+        for key, part in parts.items():
+            whole = book.sel(dict(zip(labels, key, strict=True)))
+            assert np.isfinite(whole["up_m"].values[len(part) :]).sum() == 0
+            one = whole.isel(obs=slice(len(part)))
+            for name in numbers:
+                np.testing.assert_allclose(one[name.replace(".", "p")], part[name], atol=1e-9, err_msg=name)
+            times = pd.to_datetime(part["time_utc"]).dt.tz_localize(None).to_numpy()
+            assert np.abs(one["time"].values - times).max() <= np.timedelta64(1, "ms")
+            if kind == "rss":
+                assert str(one["unit"].values) == part["unit"][0]
+            known = part["east_m"].notna().to_numpy()
+            assert np.isfinite(one["latitude"].values).tolist() == known.tolist()
+            places = data.site.frame.to_local(one["latitude"].values[known], one["longitude"].values[known])
+            np.testing.assert_allclose(places[0], part["east_m"][known], atol=2e-3)
         level = book["simulated_dbm" if kind == "rss" else "level_dbm"]
         assert level.attrs["units"] == "0.1 lg(re 1 mW)"
         if kind == "rank":

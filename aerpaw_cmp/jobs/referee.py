@@ -331,7 +331,8 @@ def _checked(frame: pd.DataFrame, data: FlightData) -> tuple[str, pd.DataFrame]:
         table[name] = given[name].astype("string").fillna("").str.strip().astype(object)
     table["level"] = _numbers(given[quantity]) if quantity else np.nan
     if not table[["level", "rank", *RANKS]].notna().any(axis=None):
-        first = f", but {frame[quantity].iloc[0]}" if quantity and len(frame) else ""
+        cells = [cell for name in (*QUANTITIES, "rank", *RANKS) if name in names for cell in frame[name].dropna()]
+        first = f", but {cells[0]}" if cells else ": all cells are empty"
         raise InputError(f"no level or rank{first}", expected="numbers with a decimal point")
     table["time"] = _times(given)
     table[list(_PLACE)] = _places(given, data.site)

@@ -209,6 +209,8 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
     ("change", "words"),
     [
         (lambda f: f.assign(tower="BS1"), "towers BS1; expected towers of the flight: LW1"),
+        (lambda f: f.assign(level_dbm=np.nan), "no level or rank: all cells are empty"),
+        (lambda f: f.assign(level_dbm="weak").iloc[1:], "no level or rank, but weak"),
         (lambda f: f.rename(columns={"level_dbm": "rss"}), "'rss' has another unit, or no unit in its name"),
         (lambda f: f.rename(columns={"level_dbm": "level_w"}), "'level_w' has another unit, or no unit in its name"),
         (lambda f: f.assign(level_dbm=10 ** (f["level_dbm"] / 10)), "watts or milliwatts"),

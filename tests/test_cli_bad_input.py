@@ -7,6 +7,7 @@ import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -105,6 +106,23 @@ def test_bad_flight_files(run: Run, change: tuple[str, str], words: str) -> None
     code, err = run(FLIGHT.replace(*change))
     assert code == 2, err
     assert words in err
+
+
+@pytest.mark.parametrize("command", ["report", "map"])
+def test_a_file_of_the_site_is_not_sent_to_ingest(run: Run, tmp_path: Path, command: str, capsys: Any) -> None:
+    """Neither 'ingest' nor another argument helps if the site names a damaged elevation model."""
+    place = "latitude_deg: 35.7, longitude_deg: -78.7"
+    (site := tmp_path / "site.yaml").write_text(
+        f"name: s\norigin: {{{place}, ground: {{height_m: 79, reference: orthometric}}}}\n"
+        f"dem: {{path: dem.asc, crs: EPSG:4326}}\ntowers: {{LW1: {{{place}}}}}\n"
+    )
+    (tmp_path / "dem.asc").write_text("hello\n")
+    code, err = run(FLIGHT.replace("lake_wheeler", "site.yaml"))
+    if command == "map":
+        code, err = main(["map", str(site), "-o", str(tmp_path / "out")]), capsys.readouterr().err
+    assert code == 3
+    assert "dem.asc, line 1: 'hello' in the header; expected a name and a number, such as 'ncols 200'. " in err
+    assert "Next: correct dem.asc, or the line that names it, and run the same command" in err
 
 
 def test_ranks_above_four_are_not_compared(run: Run) -> None:

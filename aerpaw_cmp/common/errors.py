@@ -304,6 +304,8 @@ class OutputError(AerpawCmpError):
 
 
 _SETTINGS = (".yaml", ".yml")
+# Commands whose numbers and names all come from a file.
+_OF_SETTINGS = [["report"], ["simulate"], ["calibrate"], ["campaign"]]
 _OF_LOGS = [["report"], ["explain"], ["calibrate"], ["campaign"], ["predict"], ["plan"]]
 
 
@@ -329,11 +331,11 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if "there is no telemetry log" in error.found:
         named = "--map COLUMN=latitude_deg --map COLUMN=longitude_deg names positions in the log"
         return f"'aerpaw-cmp ingest LOG TELEMETRY --draft flight.yaml' drafts it with telemetry; {named}"
-    if again := re.search(r"learn it again: (.+)", error.expected or ""):
-        return f"'{again[1]}'"
+    if again := re.search(r"(?:learn it again: |(?=pip install))(.+?)(?:, or |$)", error.expected or ""):
+        return again[1]
     if isinstance(error, CheckError):
         return "read the page, or run without the check"
-    if isinstance(error, OutputError) or re.search(r"after -o\b|a new name", error.expected or ""):
+    if isinstance(error, OutputError) or re.search(r"after -o\b|-o NAME|a new name", error.expected or ""):
         return "the same command with another name after -o"
     if place is not None and (reader := re.search(r"'(aerpaw-cmp [a-z]+) FILE' reads", error.found)):
         return f"'{reader[1]} {one_line(str(place))}'"
@@ -347,7 +349,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         if not settings and words[:1] in _OF_LOGS:
             return f"'aerpaw-cmp ingest {one_line(str(place))} --draft flight.yaml' writes one from its logs"
     settings_file = next((word for word in arguments if word.endswith(_SETTINGS)), None)
-    if place is None and settings_file and words[:1] == ["report"] and "--" not in f"{error.found} {error.expected}":
+    if place is None and settings_file and words[:1] in _OF_SETTINGS and "--" not in f"{error.found} {error.expected}":
         return f"fix {one_line(Path(settings_file).name)} and run the same command"
     if place is None or not isinstance(error, InputError):
         return f"'{command} --help' lists the options"
@@ -363,9 +365,11 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
-    if words[:1] in _OF_LOGS:
+    if words[:1] in _OF_LOGS and re.search(r"\blogs?\b|\breaders?\b", f"{error.found} {error.expected} {error.cause}"):
         return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file contains"
-    return f"the same command with another file than {one_line(place.name)}"
+    if str(place) in arguments:
+        return f"the same command with another file than {one_line(place.name)}"
+    return f"correct {one_line(place.name)}, or the line that names it, and run the same command"
 
 
 def _exists(place: Path) -> bool:

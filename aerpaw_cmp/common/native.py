@@ -65,7 +65,7 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     if code == _REFUSED and lines:
         raise InputError(**json.loads(lines[-1]))
     reason = lines[-1] if lines else f"its library ended with code {code}"
-    raise InputError(f"no {_NAMES[kind]} file, or a damaged one ({reason})", cause="a cut download")
+    raise InputError(f"not a {_NAMES[kind]} file, or a damaged one ({reason})", cause="a truncated download")
 
 
 def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:

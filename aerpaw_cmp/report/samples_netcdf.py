@@ -66,18 +66,13 @@ def _dataset(data: ReportData, kind: str, columns: Sequence[Column], series: Seq
         units.flat[cells] = texts[column]
         variables[column.name] = (axes, units, {"long_name": column.meaning})
     seconds, about = _seconds(np.concatenate([time for time, _ in rows]))
-    variables["time"] = (*placed(seconds), about)
-    samples = {
-        column.name: np.concatenate([_numbers(row[column.name]) for _, row in rows])
-        for column in members
-        if column not in texts
-    }
+    variables |= {"time": (*placed(seconds), about), "crs": ((), np.int32(0), wgs84())}
+    samples = {c.name: np.concatenate([_numbers(row[c.name]) for _, row in rows]) for c in members if c not in texts}
     degrees = (("latitude", "degrees_north"), ("longitude", "degrees_east"))
     for (name, unit), values in zip(degrees, _degrees(data, samples), strict=True):
         variables[name] = (*placed(values), {"standard_name": name, "long_name": f"WGS84 {name}", "units": unit})
-    variables["crs"] = ((), np.int32(0), wgs84())
     for column in members:
-        if column.name in samples:
+        if column not in texts:
             variables[column.name.replace(".", "p")] = (*placed(samples[column.name]), _attributes(column))
     source = "synthetic logs, replayed by ray tracing" if data.synthetic else "field logs, replayed by ray tracing"
     comment = "Heights (up_m) are metres above the ground at the site origin. A missing number is NaN."

@@ -174,7 +174,7 @@ def test_bad_grids(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_dem(tmp_path / "absent.asc", FRAME, crs="local")
     path.write_bytes(b"II*\x00" + b"0" * 100)
-    with pytest.raises((UsageError, InputError), match=r"needs rasterio|no GeoTIFF"):
+    with pytest.raises((UsageError, InputError), match=r"needs rasterio|not a GeoTIFF"):
         read_dem(path, FRAME)
 
 

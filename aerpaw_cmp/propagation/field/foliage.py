@@ -151,8 +151,6 @@ def foliage_model(
 ) -> FoliageModel:
     """Return a model by its name in flight.yaml: ``none``, ``opaque`` or ``attenuating``.
 
-    ``gamma_db_per_m`` and ``maximum_db`` replace the table's values in P.833.
-
     Parameters
     ----------
     name : str
@@ -160,7 +158,8 @@ def foliage_model(
     in_leaf : bool
         Whether the trees are in leaf.
     gamma_db_per_m, maximum_db : float, optional
-        Specific attenuation [dB/m] and largest loss [dB] instead of P.833's table.
+        Specific attenuation [dB/m] and largest loss [dB] instead of P.833's table. The models ``none`` and ``opaque``
+        do not use them.
 
     Returns
     -------
@@ -169,7 +168,7 @@ def foliage_model(
     Raises
     ------
     UsageError
-        If the name is unknown, or gamma or A_m is set for a model without it.
+        If the name is unknown.
     """
     if name == "attenuating":
         table = P833.at(frequency_hz, in_leaf=in_leaf)
@@ -177,8 +176,6 @@ def foliage_model(
             table.gamma_db_per_m if gamma_db_per_m is None else gamma_db_per_m,
             table.maximum_db if maximum_db is None else maximum_db,
         )
-    if gamma_db_per_m is not None or maximum_db is not None:
-        raise UsageError(f"the foliage model '{name}' has neither gamma nor A_m", expected="the model 'attenuating'")
     if name == "opaque":
         return Opaque()
     if name == "none":

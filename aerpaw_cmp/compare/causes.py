@@ -525,7 +525,7 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
     # also try levels of another time or in reverse order, so that they are not attributed to other causes
     since, length = e.time_s - e.time_s[0], max(float(np.ptp(e.time_s)), 1e-9)
     backwards = np.interp(length - since, since, e.predicted_db)
-    channels = 1 + len(e.others)  # which have the telemetry in common
+    channels = 1 + len(e.others)  # all channels share the telemetry, so they share the cost
     if _nearer(e, backwards):
         yield Trial(cost=_RARE / channels, channels=channels, change_db=backwards - e.predicted_db)
     if e.clock is not None and e.clock.shifted:
@@ -552,7 +552,7 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
         return
     best, cost = _likeliest(e, levels, possible=nearer)
     rate = pairs[best][0]
-    # the best rate may lie beyond those that were searched, and a clock is not so wrong
+    # no name at the end of the search, because the best rate may be larger, and no clock is that wrong
     yield Trial(
         name="clock" if abs(rate) < max(_RATES) else _UNNAMED,
         cost=_RARE + cost, change_db=levels[best] - e.predicted_db,
@@ -890,7 +890,7 @@ def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) ->
 def _controlled(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a gain control, which follows the mean level over some time, as an alternative without a name."""
     for slow in slow_levels(e.time_s, e.predicted_db):
-        # it reduces changes of the level; larger ones have another slope
+        # a gain control can only weaken changes of the level; another slope explains stronger changes
         if (e.measured_db - e.predicted_db) @ (slow - slow.mean()) < 0.0:
             yield Trial(cost=math.log(len(_CONTROLS_S)), columns=_SLOPE * (slow - slow.mean())[:, None])
 
@@ -935,7 +935,7 @@ def _limits(e: LevelEvidence) -> Iterator[Trial]:
             sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} throughout",
         )  # fmt: skip
         return
-    # a frequent least level already shows where nothing was detected
+    # if the lowest level is frequent, it marks samples without a detected signal, not a limit
     if e.least is None and not e.limits_known:
         yield from _clipping(e, 1.0)
     # signals below the noise do not overload a receiver
@@ -967,7 +967,7 @@ _LEAST_CLIPPED = 0.06
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     """Return the samples at the receiver's limit, or None if the samples at the end of the levels fade like others."""
-    if e.step_db > PILE_DB:  # each rounded level is a pile
+    if e.step_db > PILE_DB:  # coarse rounding collects many samples at each level, not only at a limit
         return None
     end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
     pile = side * (e.measured_db - end) < PILE_DB

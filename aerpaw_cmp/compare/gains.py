@@ -185,7 +185,7 @@ class Term:
 
     def shared(self, first: LinkSamples, second: LinkSamples) -> float:
         """Return the share of the covariance that samples of two series have in common."""
-        if self.per == "antenna" and first.antenna != second.antenna:  # gains of two antennas have nothing in common
+        if self.per == "antenna" and first.antenna != second.antenna:  # gains of two antennas are independent
             return 0.0
         if self.frame == "body" and first.airframe != second.airframe:
             return 0.0
@@ -871,8 +871,8 @@ class LostLock:
         reach = 6.0 * max(self.locked_sd_db, self.lost_sd_db)
         low = np.minimum(self.locked_db, self.lost_db) - reach
         high = np.maximum(self.locked_db, self.lost_db) + reach
-        # from some hundred decibels to 0.002 dB
-        for _ in range(16):  # bisection, because there is no closed form
+        # bisection, because there is no closed form: 16 steps reduce some hundred decibels to 0.002 dB
+        for _ in range(16):
             middle = 0.5 * (low + high)
             below = sum(p * ndtr((middle - mean) / sd) for p, mean, sd in self.parts)
             low, high = np.where(below < share, middle, low), np.where(below < share, high, middle)

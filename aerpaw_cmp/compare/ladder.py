@@ -288,7 +288,7 @@ def _rows(
 def _distinct(ladder: ModelComparison) -> set[int]:
     """Return the indices of models with another error than every model before them, of the last and the recommended."""
     rmse = np.array([[_rmse(error) for error in errors] for errors in ladder.error_db])
-    rmse = np.nan_to_num(rmse, nan=-1.0)  # a channel without an error is like others without one
+    rmse = np.nan_to_num(rmse, nan=-1.0)  # two models without an error on a channel are equal there
     known: list[int] = []
     for index, own in enumerate(rmse):
         alike = (np.abs(rmse[known] - own) <= _SAME_DB).all(axis=1).any()

@@ -617,7 +617,7 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
         slope=float(fits.slope[nearest]),
         slope_sd=float(fits.slope_sd[nearest]),
         anywhere=anywhere,
-        # a hover that turns shows gains of the airframe, and no distance
+        # a UAV that only turns on the spot shows the gain of its airframe, not the distance of the node
         placed=bool(
             fits.evidence.max() - afar > _PLACED_ODDS and np.ptp(track.position_m, axis=0).max() > SYSTEMATIC_M
         ),

@@ -381,7 +381,7 @@ class Channels:
         log = joined.joined("log_det") - 0.5 * terms * np.log(each)
         equal, fast = np.ones(len(RATES)), np.where(RATES > _VISIBLE, 1.0, 0.0)
         over_time = [fast if share else equal for share in WHITE_SHARES]
-        over_place = known.weights[len(known.parts[0].power) :]  # as in ``placed``, but not used there
+        over_place = known.weights[len(known.parts[0].power) :]  # the weights of ``placed``, which does not use them
         over_place = over_place / over_place.max(initial=1e-300)
         prior = np.concatenate([*over_time, equal, 0.0 * over_place, fast, equal, over_place])
         shown = prior * np.exp(further * (log - log.max()))
@@ -410,7 +410,7 @@ def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     """
     from scipy.special import gammaincinv, ndtri
 
-    ratio = 1.1673039782614187  # x^5 = x + 1
+    ratio = 1.1673039782614187  # the root of x^5 = x + 1: a low-discrepancy sequence in four dimensions
     chance = (0.5 + np.outer(np.arange(1, _PAIRS + 1), ratio ** -np.arange(1.0, 5.0))) % 1.0
     return chance[:, 0], 2.0 * gammaincinv(0.5 * terms, chance[:, 1]), ndtri(chance[:, 2]), ndtri(chance[:, 3])
 
@@ -489,7 +489,7 @@ def heavy_tails(values: FloatArray) -> float:
     """
     away, n = values - values.mean(), len(values) - 1
     keep = min(float(away[1:] @ away[:-1]) / float(away @ away), 1.0)
-    both = away[1:] - keep * away[:-1], away[:-1] - keep * away[1:]  # in both directions of time
+    both = away[1:] - keep * away[:-1], away[:-1] - keep * away[1:]  # innovations forwards and backwards in time
     square = max((np.square(e) for e in both), key=lambda e: float(e @ e) / max(float(e.mean()) ** 2, 1e-300))
     # Subtract part of the standard error, because a short normal sequence can show heavy tails by chance.
     excess = float(square @ square) / n / max(float(square.mean()) ** 2, 1e-300) - 3.0 - np.sqrt(6.0 / n)

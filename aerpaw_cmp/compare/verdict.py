@@ -319,7 +319,7 @@ class Verdict:
 # --- campaign -------------------------------------------------------------------------------------------------------
 
 
-# The p-value of a shift, and its verdict.
+# A shift of an offset: its p-value, and its verdict.
 _Shift = tuple[float, Verdict]
 
 

@@ -482,7 +482,8 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
 
     finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
     reach = int(width / 2 + 0.5)
-    weights = np.clip(width / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)  # centred, without a lag
+    # a centred window, because any other would add a lag
+    weights = np.clip(width / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)
     share = correlate1d(finite.astype(np.float64), weights, mode="nearest")
     out = correlate1d(np.where(finite[:, None], table, 0.0), weights, axis=0, mode="nearest")
     return np.asarray(np.where(finite[:, None], out / np.where(finite, share, 1.0)[:, None], np.nan))
@@ -522,7 +523,7 @@ def _whitened(
         gains[row] = keep * uncertainty / variances[row]
         uncertainty = keep**2 * uncertainty * white**2 / variances[row] + 1.0 - keep**2
     flat = columns.reshape(len(columns), 1, -1)
-    out = np.empty((len(columns), len(memory), flat.shape[2]))  # the expectation of each row first
+    out = np.empty((len(columns), len(memory), flat.shape[2]))  # the expectation of each row, until the subtraction
     out[0], buffer = 0.0, np.empty_like(out[0])
     np.multiply(flat[:-1], gains[:-1, :, None], out=out[1:])
     for last, expected, keep in zip(out[:-1], out[1:], (keeps - gains)[..., None], strict=False):

@@ -359,7 +359,8 @@ def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore 
     gain = case.replayed.learned
     flown = None if gain is None else (case.replayed.poses.position_m, gain.sd_db)
     errors, kind = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder, flown)
-    lock = None if kind == ALONE else _lock(case)  # its errors are those with the antennas of its flights
+    # the errors of a receiver were measured with the antennas of its own flights
+    lock = None if kind == ALONE else _lock(case)
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
         return None
     if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:

@@ -31,7 +31,8 @@ from ..site.site import Site
 
 _Key = TypeVar("_Key")
 _ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
-# Closer together downwards, because the level changes faster near the ground.
+# Errors of the height that are tried [m]. They are closer together downwards, because levels change faster near the
+# ground.
 _RISES_M = (-150.0, -125.0, -100.0, -75.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
 
 
@@ -117,7 +118,7 @@ def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
     It is 0 unless the RMSE also falls if a share of the slow level is fitted: a gain control reduces slow changes of
     the level, so that the rest seems to be early.
     """
-    squares = list[list[AnyArray]]()  # of each channel, without a slow level and with each
+    squares = list[list[AnyArray]]()  # errors of each channel, first without a gain control, then with each
     for e in channels:
         lag = 0.0 if e.clock is None else e.clock.radio_minus_telemetry_s
         known = np.isfinite(e.measured_db) & np.isfinite(e.predicted_db)
@@ -262,7 +263,7 @@ def _evidence(
     # the setting does not change levels of isotropic antennas, and an unknown gain turns with the aircraft
     if kinds["isotropic"] and replayed.track is not None and replayed.track.attitude_known.any():
         rotation = replayed.track.rotation
-    directions = link.directions(link.place_m, replayed.poses.position_m, rotation)  # angles wrap
+    directions = link.directions(link.place_m, replayed.poses.position_m, rotation)
     return LevelEvidence(
         name=result.name,
         tower=series.tower,

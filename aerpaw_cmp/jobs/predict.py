@@ -749,7 +749,7 @@ def _map_levels(prediction: Prediction, source: Source, n: int) -> Iterator[Corr
     mine = table[(table["tower"] == source.tower) & (table["channel"] == source.channel)]
     position = prediction.targets.position_m
     raw = source.replayed_db(source.targets(position, np.zeros(len(position)))) + source.free_space_db(position)
-    assert isinstance(prediction.model, Flown)  # a map is corrected by named flights
+    assert isinstance(prediction.model, Flown)  # only named flights correct a map
     level = mine["level_db"].to_numpy() - prediction.model.offset_db(source.antenna)
     for k, height in enumerate(prediction.targets.heights_m):
         part = slice(k * n, (k + 1) * n)

@@ -203,7 +203,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     ]
     hits = ((row, text) for text in texts for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
-    if row is not None and row.role == "other":  # a tower, a target and an antenna have levels, too
+    if row is not None and row.role == "other":  # the name of a tower, target or antenna may precede that of a level
         row, text = next((hit for hit in hits if hit[0].role in ("rss", "rank", "kpi", "cell")), (None, ""))
     # 'rx [dBm]' is a level, not the name of a receiver
     if row is None or (row.role == "identity" and is_unit(unit)):
@@ -276,7 +276,7 @@ def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning |
         shared = {} if what is None else cells.get(("identity", what.place), {})
         if what is not None and rest in shared and rest in cells.get(("level", what.place), {}):
             several = any(shared[rest] & rats for other, rats in shared.items() if other != rest)
-            # the target of a handover has an identity, the target of a model has none
+            # a target with an identity is the cell of a handover; without one, it is the goal of a model
             indirect = what.indirect and PATTERNS["indirect"].search(rest.replace("target", "")) is not None
             what = replace(what, place=f"cell {rest}" if several and rest else what.place, indirect=indirect)
         placed.append(what)

@@ -425,7 +425,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
         back = np.flatnonzero(np.diff(wall_ns // 1_000_000_000) <= -1800)
         behind = ambiguous.copy()
         behind[: back[0] + 1 if len(back) else None] = False
-        # the second pass is later by the change of the clock
+        # the second occurrence of the hour is later by the change of the clock
         utc[behind] += np.repeat((first - second)[index], length)[behind] * 1_000_000_000
         warnings.append(
             f"{counted(int(ambiguous.sum()), 'time')} in the hour that occurs twice in {name}: read as daylight time "

@@ -548,7 +548,7 @@ def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) ->
     if is_one_place(panels):
         return ONE_PLACE
     good = pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0)
-    if good or expected_sentence(panels):  # the error is that of other flights
+    if good or expected_sentence(panels):  # after a usual error, a sentence about causes would mislead
         return ""
     if max(panel.score.n for panel in panels) < FEWEST_SAMPLES:
         return FEW_SAMPLES.format(n=FEWEST_SAMPLES)

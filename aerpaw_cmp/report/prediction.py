@@ -197,7 +197,7 @@ def _stated(correction: Correction) -> str:
     error, sd = correction.held_out[correction.base, correction.title]
     verdict = stated_errors(error, sd, place_m=correction.held_out_place_m)
     known = np.isfinite(error)
-    inside = np.abs(error[known]) <= 1.6449 * sd[known]  # their 90 % intervals
+    inside = np.abs(error[known]) <= 1.6449 * sd[known]  # 1.6449 SD is half of a 90 % interval
     return said_of(verdict, STATED, inside=100.0 * float(inside.mean()) if known.any() else float("nan"))
 
 

@@ -112,6 +112,6 @@ def _attributes(column: Column) -> dict[str, Any]:
     shared: dict[str, Any] = {"long_name": column.meaning}
     if column.name.startswith(("measured_rank", "simulated_rank")):
         shared |= {"flag_values": _RANKS["flag_values"].astype(np.float64), "flag_meanings": _RANKS["flag_meanings"]}
-    elif column.name != "measured_db":  # its unit is a text per link
+    elif column.name != "measured_db":  # the unit of measured_db differs between links and has its own variable
         shared["units"] = {"dBm": DBM, "dB": DB, "": "1"}.get(column.unit, column.unit)
     return shared | {"coordinates": "time latitude longitude up_m", "grid_mapping": "crs"}

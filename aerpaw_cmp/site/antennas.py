@@ -420,9 +420,8 @@ def _as_grid(rows: _Rows) -> tuple[bool, FloatArray]:
     key = np.round(rows.values[:, :2], 5)
     phi, at_phi = np.unique(key[:, 0], return_inverse=True)
     theta, at_theta = np.unique(key[:, 1], return_inverse=True)
-    if (
-        len(theta) < 3 or len(phi) * len(theta) > 2 * len(key) + 1000
-    ):  # not a grid, whose table of angles could be too large
+    # scattered directions are not a grid, and a table of all their angles could fill the memory
+    if len(theta) < 3 or len(phi) * len(theta) > 2 * len(key) + 1000:
         raise InputError(
             f"{len(key)} rows with {len(phi)} values of phi and {len(theta)} of theta",
             expected="a grid over the sphere: every phi with every theta",

@@ -453,7 +453,7 @@ class Sheet:
                 dictionary.PATTERNS["where_or_when"].search(words) is not None
                 or self.unit_read(column) in _OF_LEVELS[1:]
             )
-            # an index of the level of an unknown radio access, where no level is read
+            # Android's index of a level (ASU) counts as a level if no other level is read
             levels = (what for i in self.used if (what := self.meanings[i]) and what.quantity.role == "rss")
             like |= _ASU.search(words) is not None and not any(levels)
             like |= dictionary.PATTERNS["neighbour"].search(words) is not None
@@ -619,7 +619,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     first = "".join(row[0].strip() for _, row in written[:3] if len(row) == len(names) + 1 and row[-1].strip())
     if first in ("123", "012"):
         names = ["", *names]
-    # the further lines of a row are comments
+    # a row of several lines counts once: its other lines count as comments
     comments = [*range(at + 1), *sorted({*numbers} - {i for i, _ in written})]
     header, rows, begun = _Header(_unique_names(names, group)), list[_Row](), False
     for i, fields in _without_empty_end(written, names):
@@ -1177,7 +1177,8 @@ def _add_milliseconds(rows: Rows, milliseconds: FloatArray) -> None:
     zero = (time - counted)[known]
     if not fits or zero.max() - zero.min() > _MOST_APART_NS:
         if fits and (counted >= 0).all() and (counted < 1_000_000_000).all():
-            rows.time = (time + counted).astype("datetime64[ns]")  # fractions of each second, no count since the start
+            # the column contains the fraction of each second, not the time since the start
+            rows.time = (time + counted).astype("datetime64[ns]")
             return
         rows.warnings.append("the column of milliseconds does not fit the times and is not used")
         return

@@ -360,7 +360,7 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""
         unit = written if (written := sheet.unit_read(cell.columns["rsrp_dbm"])).startswith("dB") else "dBm"
         owned.setdefault((owner, "", cell.quantity, unit), []).append(cell)
-        for port in cell.ports:  # the same cell under another name
+        for port in cell.ports:  # the level of a port is a separate series of the same cell
             of_port = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
             key = (owner, _short(sheet, port), cell.quantity, unit)
             owned.setdefault(key, []).append(replace(cell, columns=of_port))
@@ -536,7 +536,8 @@ def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream 
     if tower and tower[3]:
         about["channel"] = f"{tower[3]}{tower[4]}".upper()
     if meaning is not None and meaning.place.startswith("cell") and "cell" in name:
-        about |= {"cell": meaning.place, "part": meaning.place}  # unlike 'rsrp 2', not a second reading of one cell
+        # 'cell 2 rsrp' is another cell, whereas 'rsrp 2' is a second reading of one cell
+        about |= {"cell": meaning.place, "part": meaning.place}
     if tower and name == f"snr {tower[0]}":
         return snr_stream(rows, about["node"], values)
     where, unit = np.isfinite(values), sheet.unit_read(column)

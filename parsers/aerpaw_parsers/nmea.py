@@ -76,7 +76,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         time = _CLOCK.sub(r"\1:\2:\3Z", fields[0])
         if dates:
             _, day, clock = dates[max(int(np.searchsorted(at, i)) - 1, 0)]
-            # the sentence with the date may lie on the other side of midnight
+            # the nearest sentence with a date may be from the day before or after
             days = int(day[:2]) - 1 + round((_day_s(clock) - _day_s(fields[0])) / 86_400)
             time = f"{np.datetime64(f'20{day[-2:]}-{day[2:4]}-01') + days}T{time}"
         cells = dict(zip(_PLACE, fields[1:5] if high else fields[2:6], strict=True))

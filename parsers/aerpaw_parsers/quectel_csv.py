@@ -95,7 +95,7 @@ def _stamped(data: bytes) -> bytes:
             stamp = wall + (b"." + milliseconds if milliseconds else b"") + zone
             if epoch:
                 stamp = datetime.fromtimestamp(float(epoch), timezone.utc).isoformat().encode()
-        # the program's words between time and answer are not kept
+        # remove words that a program printed between the time and the answer
         answer = _CONSOLE.search(line, found.end()) if found else _CONSOLE.match(line)
         if stamp and (answer or found):
             lines[i] = b"[" + stamp + b"] " + (answer[0] if answer else b"")

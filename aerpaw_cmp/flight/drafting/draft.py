@@ -214,7 +214,7 @@ def draft(
     if not kinds & {"rss", "rank"}:
         # a table of positions may contain levels under an unknown name, which its warnings list
         unread = [text for file in files for text in file.result.warnings if "--map" in text]
-        # a track of another flight is no reason
+        # do not list unused tracks, because they do not explain why there is no level
         radio = [line for line in lines if any(s.kind != "telemetry" for s in line.file.result.streams)]
         reasons = unread + sorted(remark for line in radio for remark in line.remarks)
         raise UsageError(
@@ -705,7 +705,7 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
     if any("\ud800" <= letter <= "\udfff" for letter in path):  # bytes that are not UTF-8, as Python represents them
         remark = f"{shown}: flight.yaml cannot contain a name that is not UTF-8; rename the file"
         return _Line(file=file, shown=shown, remarks=(remark,))
-    streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
+    streams = [s for s in file.result.streams if s.kind != "kpi"]  # reports do not compare kpis
     origin = None if context.options.time_origin else _origin(streams, context.flown)
     entry, comment, places = _with_node(file, path, streams, origin, context, earlier)
     if context.is_utc(file):

@@ -277,7 +277,7 @@ class NodeFinder:
                 else f"no position fits the levels clearly better than {' or '.join(alike)}"
             )
             return Placement(name, None, f"{fits}: {asked}")
-        assert estimate is not None  # no tower fits
+        assert estimate is not None  # the search ran, because no tower fits
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
         near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]

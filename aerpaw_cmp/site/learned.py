@@ -342,9 +342,10 @@ _Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 
 
 class Learned(StrictModel):
-    """All learned models of a site, by name."""
+    """All learned models of a site, by name. ``names`` shows that no entry of the file is missing."""
 
     format: Literal["aerpaw-cmp learned 3"] = "aerpaw-cmp learned 3"
+    names: list[_Name] = Field(default_factory=list)
     entries: dict[_Name, Entry] = Field(default_factory=dict)
 
 
@@ -406,6 +407,8 @@ def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | No
     index, lost, damage = inside(folder, _INDEX, folder / _INDEX), dict[str, str](), None
     try:
         memory = load_yaml(index, Learned) if index.is_file() else Learned()
+        if memory.names != [*memory.entries]:
+            raise UsageError(f"names {', '.join(memory.names)}, but entries {', '.join(memory.entries)}", path=index)
     except UsageError as error:
         damage, memory = error, Learned()
         text = read_bounded(index, LARGEST_TABLE, "an index").decode("utf-8", "replace")
@@ -418,6 +421,8 @@ def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | No
                 lost[name] = entry
             else:
                 memory.entries[name] = entry
+        names = {*re.findall(r"[\w.-]+", "".join(re.findall(r"^names: \[([^]]*)", text, re.M)))}
+        lost |= {name: f"the calibration of {name}" for name in sorted(names - {*memory.entries, *lost})}
     for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
         # check before a file is opened, because an index may be untrusted
         inside(folder, name, index, plain=True)
@@ -517,9 +522,9 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
             made = entry.model_copy(update={"tables": tables})
             made = made.model_copy(update={"sha256": made.digest})
             entries = dict(sorted({**memory.entries, name: made}.items()))
-            text = dump_yaml(memory.model_copy(update={"entries": entries}).model_dump(mode="json", exclude_none=True))
+            memory = Learned(names=list(entries), entries=entries)
             # write the index after the tables, so that every entry has its files
-            write_whole(folder / _INDEX, text)
+            write_whole(folder / _INDEX, dump_yaml(memory.model_dump(mode="json", exclude_none=True)))
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):
                 # do not remove a table that was changed later

@@ -16,7 +16,7 @@ from ..compare import level as rss
 from ..compare.causes import CATCH_ALL, OF_DIRECTION, SHOWN_DB, flight_cause, gains_by_direction, slow_levels
 from ..compare.evidence import LevelEvidence
 from ..compare.gains import turned
-from ..compare.result import Cause, RssResult
+from ..compare.result import OK, Cause, RssResult
 from ..compare.verdict import lock_lost, pooled_db, without_copies
 from ..flight.data import FlightData, RssSeries, Times
 from ..flight.gains import mean_gain_db
@@ -72,7 +72,7 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     rotations: dict[tuple[str, bytes], FloatArray] = {}
     evidence = [_evidence(data, *each, rotations=rotations, scaled=not meant) for each in compared]
     cause = flight_cause(evidence)
-    late = _late_clock(evidence, [series.tower for series, _, _ in compared])
+    late = _late_clock(evidence)
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
     # prefer the test of the clock, which knows gains over directions, to a pattern; it does not know obstacles
     if late is not None and (cause is None or CATCH_ALL in cause.name.split(" or ")):
@@ -86,11 +86,11 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     return None, _CALIBRATE
 
 
-def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cause | None:
+def _late_clock(evidence: Sequence[LevelEvidence]) -> Cause | None:
     """Return the radio clocks that are wrong, if correcting them lowers the printed error of their towers."""
     late: dict[str, list[str]] = {}
-    for tower in dict.fromkeys(towers):
-        here = [e for e, at in zip(evidence, towers, strict=True) if at == tower]
+    for tower in dict.fromkeys(e.tower for e in evidence):
+        here = [e for e in evidence if e.tower == tower]
         clock = here[0].clock
         if clock is None or not clock.shifted:
             continue
@@ -101,14 +101,14 @@ def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cau
     if not late:
         return None
     found = {tower for each in late.values() for tower in each}
-    others = sorted(set(towers) - found)
+    right = sorted({e.tower for e in evidence if e.clock is not None and e.clock.verdict == OK})
     lags = [f"The radio clock at {', '.join(each)} is {words}" for words, each in late.items()]
-    only = f"; those at {', '.join(others)} are not" if others else ""
+    only = f"; those at {', '.join(right)} are right" if right else ""
     return Cause(
         name="clock",
         sentence=f"{'. '.join(lags)}{only}.",
         next_step="`rss: {lag: apply}`",
-        channels=tuple(e.name for e, at in zip(evidence, towers, strict=True) if at in found),
+        channels=tuple(e.name for e in evidence if e.tower in found),
     )
 
 

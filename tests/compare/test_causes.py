@@ -789,8 +789,8 @@ def test_an_antenna_pattern_needs_log_odds_and_a_quarter_of_the_error_of_the_oth
 def test_a_lag_with_an_interval_wider_than_itself_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _: 0.4)
     sure, vague = _clock(3.0, "shifted"), replace(_clock(3.0, "shifted"), ci95_s=(1.0, 4.5))
-    assert likely_cause._late_clock([replace(_sound(), clock=sure)], ["LW1"]) is not None
-    assert likely_cause._late_clock([replace(_sound(), clock=vague)], ["LW1"]) is None
+    assert likely_cause._late_clock([replace(_sound(), clock=sure)]) is not None
+    assert likely_cause._late_clock([replace(_sound(), clock=vague)]) is None
 
 
 def test_channels_of_a_tower_share_the_instant_of_a_step() -> None:

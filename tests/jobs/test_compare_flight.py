@@ -50,12 +50,15 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
     ):
         late = SimpleNamespace(
             name="LW1 A",
+            tower="LW1",
             antenna="",
             clock=SimpleNamespace(
-                shifted=shifted, in_words="0.40 s ahead", radio_minus_telemetry_s=0.4, ci95_s=(0.3, 0.5)
+                shifted=shifted, in_words="0.40 s ahead", radio_minus_telemetry_s=0.4, ci95_s=(0.3, 0.5), verdict=""
             ),
         )
-        right = SimpleNamespace(name="LW2 A", antenna="", clock=SimpleNamespace(shifted=False))
+        right = SimpleNamespace(
+            name="LW2 A", tower="LW2", antenna="", clock=SimpleNamespace(shifted=False, verdict="ok")
+        )
         named = None if other is None else Cause(name=other, sentence="", next_step="")
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
         monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _, fall_db=fall_db: fall_db)
@@ -77,19 +80,22 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
             for i, name in enumerate(("LW1", "LW2"), 1)
         ]
         cause, _ = likely_cause.cause_of(data, replays, results)
-        said = "The radio clock at LW1 is 0.40 s ahead; those at LW2 are not."
+        said = "The radio clock at LW1 is 0.40 s ahead; those at LW2 are right."
         assert (cause is not None and (cause.sentence, cause.next_step) == (said, "`rss: {lag: apply}`")) == bool(first)
 
 
 def test_late_clocks_of_one_computer_have_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _: 0.4)
-    names = ("LW1", "LW2", "LW3")
-    lags: Any = [SimpleNamespace(name=f"{at} A", clock=SimpleNamespace(
-                shifted=at != "LW3", in_words="0.40 s ahead", radio_minus_telemetry_s=0.4, ci95_s=(0.3, 0.5)))
+    names = ("LW1", "LW2", "LW3", "LW4", "LW5")
+    wide, verdicts = {"LW4": (0.1, 0.7)}, {"LW3": "ok", "LW5": "cannot tell"}
+    lags: Any = [SimpleNamespace(name=f"{at} A", tower=at, clock=SimpleNamespace(
+                shifted=at not in verdicts, in_words="0.40 s ahead", radio_minus_telemetry_s=0.4,
+                ci95_s=wide.get(at, (0.3, 0.5)), verdict=verdicts.get(at, "shifted")))
                  for at in names]  # fmt: skip
-    cause = likely_cause._late_clock(lags, names)
+    cause = likely_cause._late_clock(lags)
     assert cause is not None
-    assert cause.sentence == "The radio clock at LW1, LW2 is 0.40 s ahead; those at LW3 are not."
+    # LW4 is ahead, too, but with an interval wider than its lag, and the clock of LW5 is unknown
+    assert cause.sentence == "The radio clock at LW1, LW2 is 0.40 s ahead; those at LW3 are right."
     assert cause.channels == ("LW1 A", "LW2 A")
 
 

@@ -121,8 +121,8 @@ def test_a_file_of_the_site_is_not_sent_to_ingest(run: Run, tmp_path: Path, comm
     if command == "map":
         code, err = main(["map", str(site), "-o", str(tmp_path / "out")]), capsys.readouterr().err
     assert code == 3
-    assert "dem.asc, line 1: 'hello' in the header; expected a name and a number, such as 'ncols 200'. " in err
-    assert "Next: correct dem.asc, or the line that names it, and run the same command" in err
+    assert "dem.asc, line 1: header 'hello'; expected a name and a number. " in err
+    assert "Next: correct dem.asc or name another file, and run the same command" in err
 
 
 def test_ranks_above_four_are_not_compared(run: Run) -> None:

@@ -367,9 +367,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
     if words[:1] in _OF_LOGS and re.search(r"\blogs?\b|\breaders?\b", f"{error.found} {error.expected} {error.cause}"):
         return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file contains"
-    if str(place) in arguments:
-        return f"the same command with another file than {one_line(place.name)}"
-    return f"correct {one_line(place.name)}, or the line that names it, and run the same command"
+    return f"correct {one_line(place.name)} or name another file, and run the same command"
 
 
 def _exists(place: Path) -> bool:

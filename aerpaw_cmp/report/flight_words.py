@@ -502,8 +502,6 @@ class Headline:
     reference: str
 
 
-# Largest number of words of a summary.
-MOST_WORDS = 60
 TO_SCORE = "To score it: `calibrate` on other flights, then `report --with`."
 
 

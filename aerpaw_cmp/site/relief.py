@@ -331,8 +331,7 @@ def _ascii_header(lines: list[str]) -> tuple[dict[str, float], int]:
         try:
             header[word[0].lower()] = float(word[1])
         except (IndexError, ValueError):
-            found = f"'{lines[begin - 1][:40]}' in the header"
-            raise InputError(found, expected="a name and a number, such as 'ncols 200'", line=begin) from None
+            raise InputError(f"header '{lines[begin - 1][:40]}'", expected="a name and a number", line=begin) from None
     missing = {"ncols", "nrows", "cellsize"} - set(header)
     if missing or not ({"xllcorner", "xllcenter"} & set(header) and {"yllcorner", "yllcenter"} & set(header)):
         raise InputError("not an ESRI ASCII grid", expected="ncols, nrows, xllcorner, yllcorner, cellsize", line=1)

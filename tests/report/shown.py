@@ -21,6 +21,8 @@ from aerpaw_cmp.report.prediction import cautions, first_words
 from benchmarks import fabricated
 
 Fixture = Callable[[str], Any]
+# Largest number of words in the summary of a page.
+MOST_WORDS = 60
 # Words of the made-up records themselves.
 DATA = (
     "made for a test", "Towers of another source differ by up to 9 m.", "repeated lines were re-expanded from",

@@ -23,7 +23,6 @@ from aerpaw_cmp.report.flight import metrics
 from aerpaw_cmp.report.flight_words import (
     AS_SET,
     FEW_SAMPLES,
-    MOST_WORDS,
     NO_CAUSE,
     OFFSETS,
     ONE_PLACE,
@@ -40,6 +39,7 @@ from aerpaw_cmp.report.flight_words import (
     rss_verdict,
 )
 from benchmarks.fabricated import with_numbers
+from tests.report.shown import MOST_WORDS
 
 
 def test_pooled_error_is_that_of_all_samples_together():

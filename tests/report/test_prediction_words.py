@@ -8,8 +8,8 @@ import pytest
 
 from aerpaw_cmp.compare.calibration import OFF, Correction
 from aerpaw_cmp.compare.field_gp import FieldModel
-from aerpaw_cmp.report.flight_words import MOST_WORDS
 from aerpaw_cmp.report.prediction import FIELD, cautions, first_words
+from tests.report.shown import MOST_WORDS
 
 FREE, LEARNED, WITH_FIELD = ("free space", OFF), ("learned", OFF), ("learned", "field of 2 dB, 30 m")
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.jobs.bench import median_seconds, path_search_ratios
+from aerpaw_cmp.jobs.bench import median_seconds, path_search_ratios, random_scene, speed_against_error
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.ingest import contest, write_sounder
@@ -50,11 +50,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="100 places, few rays, lines and links")
     quick = parser.parse_args().quick
-    search = path_search_ratios(100, (1_000, 10_000)) if quick else path_search_ratios(1_000, (1_000, 10_000, 100_000))
+    samples = (1_000, 10_000) if quick else (1_000, 10_000, 100_000)
+    rows = speed_against_error(*random_scene(100 if quick else 1_000), samples=samples, depths=(2,))
+    search = path_search_ratios(rows)
     ranks = ranks_vs_svd(1_000 if quick else 100_000)
     ratios = {
         "path search, image engine / PathSolver at equal error": search["equal_error"]["ratio"],
-        "path search, image engine / PathSolver with 1e5 samples": search["at"].get("1e+05", {}).get("ratio"),
+        "path search, image engine / PathSolver with 1e5 samples": search.get("1e5", {}).get("ratio"),
         "ingest / pandas (C engine, times in UTC), 1 000 000 lines": utc_vs_pandas(10_000 if quick else 1_000_000),
         "ranks of 100 000 4 x 4 links / numpy.linalg.svd": ranks["ratio"],
     }

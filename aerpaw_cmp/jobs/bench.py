@@ -22,7 +22,6 @@ from ..propagation.check.audit import RANK_K, compare
 from ..propagation.geometry import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from ..propagation.options import Run, Search
 from ..propagation.replay import Replay, replay
-from ..propagation.scene import Scene
 from ..site.site import Building, Site, Tower
 
 # Largest number of reflections of the reference and of the Sionna rows.
@@ -30,6 +29,9 @@ _DEPTH = 2
 
 # Poses per PathSolver call.
 BATCH = 50
+
+# Runs of each image row.
+_REPEATS = 5
 
 Row: TypeAlias = "dict[str, Any]"
 
@@ -60,7 +62,7 @@ def run_bench(
     """
     site, link, some = random_scene(poses)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    measured = _against_peers(progress) if ratios else {}
+    measured = _against_peers(rows, progress) if ratios else {}
     scene = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
     return {
         "conditions": scene | {"cpus": os.cpu_count()},
@@ -70,14 +72,12 @@ def run_bench(
     }
 
 
-def _against_peers(progress: Progress) -> dict[str, Any]:
-    """Return the speed relative to each other program, first at equal error. None if it is not installed."""
-    progress("path search against PathSolver, at equal error and at 1e6 samples")
-    searches = path_search_ratios()
+def _against_peers(rows: Sequence[Row], progress: Progress) -> dict[str, Row | None]:
+    """Return the speed relative to each other program. None if it is not installed or was not measured."""
+    searches = path_search_ratios(rows)
     progress("Kriging against PyKrige, reading against pandas")
     return {
-        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
-        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        **{f"path_search_image_vs_sionna_{name}": searches.get(name) for name in ("equal_error", "1e6")},
         "kriging_vs_pykrige": kriging_vs_pykrige(),
         "ingest_vs_pandas": ingest_vs_pandas(),
     }
@@ -113,11 +113,12 @@ def speed_against_error(
     list of dict
         The image engine is first, because Sionna increases the memory of the process permanently. A row has
 
-        - ``engine``, ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``; - ``seconds`` (wall
-        time, warm), ``links_per_s`` (pose-tower pairs), ``peak_mib`` (process; 0: unknown); - ``missing_paths``,
-        ``extra_paths``, ``coverage_differs`` (links with a level in one replay only); - ``rss_max_error_db``,
-        ``rss_rms_error_db`` over links with a level in both replays (None if there are no such links); -
-        ``rank_disagreement`` by K.
+        - ``engine``, ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``
+        - ``seconds`` (wall time, warm), ``search_seconds`` (those of the path search), ``links_per_s`` (pose-tower
+          pairs), ``peak_mib`` (process; 0: unknown)
+        - ``missing_paths``, ``extra_paths``, ``coverage_differs`` (links with a level in one replay only)
+        - ``rss_max_error_db``, ``rss_rms_error_db`` over links with a level in both replays (None if there are none)
+        - ``rank_disagreement`` by K
     """
     reference = replay(site, link, poses, Search(max_depth=_DEPTH))
     rows = []
@@ -140,8 +141,9 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
         replay(site, link, poses[:BATCH], search, run=alone)  # compiles the kernels
     begin_peak()
     started = time.perf_counter()
-    result = replay(site, link, poses, search, run=alone)
-    seconds = time.perf_counter() - started
+    # the image engine's search takes a few hundredths of a second, so that one run would mainly show the machine's load
+    runs = [replay(site, link, poses, search, run=alone) for _ in range(1 if sionna else _REPEATS)]
+    seconds, result = (time.perf_counter() - started) / len(runs), runs[-1]
     difference = compare(result, reference, np.arange(len(poses)), RANK_K)
     errors = {"rss_max_error_db": difference.rss_max_error_db, "rss_rms_error_db": difference.rss_rms_error_db}
     return {
@@ -153,6 +155,7 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
         "coverage_differs": difference.coverage_differs,
         **{name: value if np.isfinite(value) else None for name, value in errors.items()},
         "seconds": seconds,
+        "search_seconds": statistics.median(run.search_seconds for run in runs),
         "peak_mib": peak_mib(),
         "rank_disagreement": {f"{k:g}": share for k, share in difference.rank_disagreement.items()},
         "links_per_s": len(poses) * len(link.tower_arrays) / max(seconds, 1e-9),
@@ -162,75 +165,23 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
 # --- comparison with peers --------------------------------------------------------------------------------------------
 
 
-def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5) -> dict[str, Any]:
-    """Compare the path search of the image engine with Sionna's PathSolver, both warm, in one run.
-
-    Parameters
-    ----------
-    poses : int
-        Number of poses of :func:`random_scene`.
-    samples : int
-        Rays of PathSolver.
-    repeats : int
-        Runs of the image engine before and after Sionna, because the load of the machine may change. The median is
-        used.
+def path_search_ratios(rows: Sequence[Row]) -> dict[str, Row]:
+    """Return how many times faster the image engine's search is than each Sionna row of :func:`speed_against_error`.
 
     Returns
     -------
     dict
-        ``seconds_image``, ``seconds_sionna``, ``ratio``, ``missing_paths``, ``extra_paths`` and ``rss_max_error_db``
-        (image against Sionna), ``poses`` and ``samples``.
+        Sionna rows with their ``ratio``: by the number of samples (``1e3``), and as ``equal_error`` the row with the
+        fewest samples that find as many paths as the most samples. A comparison with more samples would favour the
+        image engine. Empty without Sionna rows.
     """
-    from ..propagation.search import mirror, sionna
-
-    site, link, some = random_scene(poses)
-    scene = Scene.of(site, link, some)
-    rays, alone = Search("sionna", samples=samples, batch=BATCH), Run(cache_dir="")
-
-    def search() -> float:
-        started = time.perf_counter()
-        mirror.find_paths(scene.faces, scene.links_to(some), max_depth=_DEPTH)
-        return time.perf_counter() - started
-
-    search()
-    times = [search() for _ in range(repeats)]
-    replay(site, link, some[:BATCH], rays, run=alone)  # compiles the kernels
-    theirs = replay(site, link, some, rays, run=alone)
-    # half before and half after, so that a slower machine affects both
-    times += [search() for _ in range(repeats)]
-    difference = compare(replay(site, link, some), theirs, np.arange(poses))
-    seconds = float(np.median(times))
-    return {
-        "ratio": theirs.search_seconds / seconds,
-        "seconds_image": seconds,
-        "seconds_sionna": theirs.search_seconds,
-        "missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths,
-        "rss_max_error_db": difference.rss_max_error_db,
-        "poses": poses,
-        "samples": samples,
-        "versions": sionna.engine_versions(),
-    }  # fmt: skip
-
-
-def path_search_ratios(
-    poses: int = 1000, samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000)
-) -> dict[str, Any]:
-    """Compare path searches for increasing ``samples`` of PathSolver, and at equal error.
-
-    Returns
-    -------
-    dict
-        ``at`` maps samples to the numbers of :func:`path_search`. ``equal_error`` is the entry with the fewest samples
-        that find as many paths as the most samples. A comparison with more samples would favour the image engine.
-    """
-    most = path_search(poses, samples[-1])
-    at = {samples[-1]: most}
-    for count in samples[:-1]:
-        at[count] = path_search(poses, count, repeats=3)
-        if at[count]["extra_paths"] <= most["extra_paths"]:
-            break
-    enough = min(n for n, measured in at.items() if measured["extra_paths"] <= most["extra_paths"])
-    return {"at": {f"{n:.0e}": measured for n, measured in sorted(at.items())}, "equal_error": at[enough]}
+    image = next(row for row in rows if row["engine"] == "image" and row["depth"] == _DEPTH)
+    sionna = [
+        {**row, "ratio": row["search_seconds"] / image["search_seconds"]} for row in rows if row["engine"] == "sionna"
+    ]
+    at = {f"{row['samples']:.0e}".replace("e+0", "e"): row for row in sionna}
+    enough = [row for row in sionna if row["missing_paths"] <= sionna[-1]["missing_paths"]]
+    return {**at, "equal_error": enough[0]} if sionna else {}
 
 
 def median_seconds(action: Callable[[], Any], repeats: int) -> float:

@@ -8,7 +8,6 @@ stored under a digest of its inputs, so no finished task is computed twice.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import io
 import json
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter
+from pydantic_core import to_json
 
 from ..common.content import trained_on
 from ..common.errors import AerpawCmpError, InputError, UsageError, parsing
@@ -176,7 +176,11 @@ class OutcomeStore:
             # a pickle in a shared folder could run code of its writer
             with parsing(file, any_shape=True), np.load(io.BytesIO(content), allow_pickle=False) as parts:
                 arrays = {name: parts[name] for name in parts.files}
-                return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]
+                outcome = json.loads(
+                    arrays["content"].tobytes(),
+                    object_hook=lambda part: arrays[part[_ARRAY]] if _ARRAY in part else part,
+                )
+                return self._kind.validate_python([outcome])[0]
         except InputError:
             self.warnings.append(f"an outcome that this tool did not write was not used: {file}")
             return None
@@ -184,8 +188,8 @@ class OutcomeStore:
     def save(self, key: str, outcome: Any) -> None:
         """Write an entry atomically. If the disk cannot be written, store nothing and do not fail."""
         arrays = _Arrays()
-        text = json.dumps(_plain(outcome, arrays), default=lambda number: number.item())
-        content = np.frombuffer(text.encode(), dtype=np.uint8)
+        text = to_json(outcome, fallback=arrays.plain, inf_nan_mode="constants")
+        content = np.frombuffer(text, dtype=np.uint8)
         entry = io.BytesIO()
         np.savez(entry, content=content, **arrays.by_name)  # type: ignore[arg-type]
         write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)
@@ -195,25 +199,6 @@ class OutcomeStore:
 _ARRAY = "array of the entry"
 
 
-def _plain(value: Any, arrays: _Arrays) -> Any:
-    """Return a record as plain values for JSON, with the names of its arrays."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name), arrays) for field in dataclasses.fields(value)}
-    if isinstance(value, np.ndarray):
-        return {_ARRAY: arrays.put(value)}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item, arrays) for key, item in value.items()}
-    return [_plain(item, arrays) for item in value] if isinstance(value, (tuple, list)) else value
-
-
-def _with_arrays(value: Any, arrays: Mapping[str, AnyArray]) -> Any:
-    """Replace the names of arrays in plain values of JSON by the arrays."""
-    if isinstance(value, dict):
-        named = value.get(_ARRAY)
-        return arrays[named] if named else {key: _with_arrays(item, arrays) for key, item in value.items()}
-    return [_with_arrays(item, arrays) for item in value] if isinstance(value, list) else value
-
-
 class _Arrays:
     """Arrays by name, each stored once, because channels of a tower share times and positions (half of the volume)."""
 
@@ -221,13 +206,15 @@ class _Arrays:
         self.by_name: dict[str, AnyArray] = {}
         self._names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
 
-    def put(self, array: AnyArray) -> str:
-        """Return the name of an array, which is stored if it is new."""
-        if array.dtype.hasobject:  # NumPy would pickle objects
+    def plain(self, value: Any) -> Any:
+        """Return the name of an array in place of it, and a number of NumPy as a number of Python."""
+        if not isinstance(value, np.ndarray):
+            return value.item()
+        if value.dtype.hasobject:  # NumPy would pickle objects
             raise TypeError("an outcome cannot contain arrays of objects")
-        name = self._names.setdefault((array.dtype.str, array.shape, array.tobytes()), f"a{len(self._names)}")
-        self.by_name[name] = array
-        return name
+        name = self._names.setdefault((value.dtype.str, value.shape, value.tobytes()), f"a{len(self._names)}")
+        self.by_name[name] = value
+        return {_ARRAY: name}
 
 
 # Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit.

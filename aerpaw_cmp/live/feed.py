@@ -48,13 +48,6 @@ _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 
-# Fields of a status that the page shows unchanged.
-_STATUS = (
-    *("connected", "ri_rate_hz", "gaps", "missed", "predicts"),
-    *("records", "bytes_written", "disk_free_bytes", "disk_fault"),
-)
-
-
 class Rows:
     """The last rows of a table of 32-bit floats. Rows are numbered from zero over the whole session."""
 
@@ -95,17 +88,11 @@ class _Modem:
 
     name: str
     port: str = ""
+    status: TapStatus = field(default_factory=TapStatus)
     connected: bool = False
     rank: int | None = None
     rsrp_dbm: float | None = None
     sinr_db: float | None = None
-    ri_rate_hz: float = 0.0
-    gaps: int = 0
-    missed: int = 0
-    records: int = 0
-    bytes_written: int | None = None
-    disk_free_bytes: int | None = None
-    disk_fault: str = ""
     offset_db: float | None = None
     inside: list[int] | None = None
     age_s: float | None = None
@@ -125,11 +112,12 @@ class _Modem:
     sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=64))
     open: dict[str, Alarm] = field(default_factory=dict)
 
-    _SHOWN = (*_STATUS, "name", "port", "rank", "rsrp_dbm", "sinr_db", "offset_db", "inside", "ended")
+    # the status has the first four, too, but a record may be later
+    _SHOWN = ("connected", "rank", "rsrp_dbm", "sinr_db", "name", "port", "predicts", "offset_db", "inside", "ended")
 
     def shown(self) -> dict[str, Any]:
         """Return the present values that the page shows."""
-        return {name: getattr(self, name) for name in self._SHOWN}
+        return asdict(self.status) | {name: getattr(self, name) for name in self._SHOWN}
 
 
 class Feed:
@@ -238,8 +226,7 @@ class Feed:
         return (mono_ns - self._start_mono_ns) / 1e9
 
     def _status(self, modem: _Modem, status: TapStatus) -> None:
-        for name in _STATUS:
-            setattr(modem, name, getattr(status, name))
+        modem.status, modem.connected, modem.predicts = status, status.connected, status.predicts
         if status.message and status.message not in _alarms_of(modem, self.now()).values():
             self._raise(modem, "message", status.message).end_s = self.now()  # a message has no duration
 
@@ -370,9 +357,9 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
             alarms["gps"] = "no position: the telemetry log has no lines yet"
         else:
             alarms["gps"] = f"no position for more than {lost_s:g} s: the telemetry log does not reach the present"
-    if modem.disk_fault:
-        alarms["disk"] = f"the log cannot be written: {modem.disk_fault}; records wait in memory"
-    elif modem.disk_free_bytes is not None and modem.disk_free_bytes < _DISK_LOW_BYTES:
+    if modem.status.disk_fault:
+        alarms["disk"] = f"the log cannot be written: {modem.status.disk_fault}; records wait in memory"
+    elif modem.status.disk_free_bytes is not None and modem.status.disk_free_bytes < _DISK_LOW_BYTES:
         alarms["disk"] = f"less than {_DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
     if modem.step_s is not None and now - modem.step_s < _STEP_SHOWN_S:
         alarms["step"] = modem.step_text

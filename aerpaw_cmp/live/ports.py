@@ -425,15 +425,15 @@ class TapStatus:
         Text to be shown once (a loss, a fault, a hint). Empty on regular calls.
     """
 
-    connected: bool
-    rank: int | None
-    rsrp_dbm: int | None
-    sinr_db: int | None
-    ri_rate_hz: float
-    gaps: int
-    records: int
-    bytes_written: int
-    disk_free_bytes: int | None
+    connected: bool = False
+    rank: int | None = None
+    rsrp_dbm: int | None = None
+    sinr_db: int | None = None
+    ri_rate_hz: float = 0.0
+    gaps: int = 0
+    records: int = 0
+    bytes_written: int = 0
+    disk_free_bytes: int | None = None
     disk_fault: str = ""
     missed: int = 0
     predicted_rank: int | None = None

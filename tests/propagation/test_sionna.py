@@ -243,8 +243,9 @@ def test_cuda_and_llvm_agree(sionna, scenes, lone):
 
     code = (
         "import sys; from aerpaw_cmp.propagation.search import sionna; import numpy as np, pickle;"
-        "from aerpaw_cmp.propagation.options import Search;"
-        "case = pickle.load(open(sys.argv[1], 'rb')); sionna.load_variant(sys.argv[2]);"
+        "from aerpaw_cmp.propagation import llvm; from aerpaw_cmp.propagation.options import Search;"
+        "case = pickle.load(open(sys.argv[1], 'rb')); llvm.prepare_llvm();"
+        "import mitsuba; mitsuba.set_variant(sys.argv[2] + '_ad_mono_polarized');"
         "p = sionna.find_paths(*case, Search('sionna', samples=100000, batch=25), carrier_hz=3.4e9);"
         "np.savetxt(sys.argv[3], np.column_stack([p.pose, p.tower, p.faces]), fmt='%d')"
     )

@@ -21,7 +21,7 @@ import gc
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,64 +63,51 @@ _EDGE_TOLERANCE_M = 1e-3
 # then define a function twice and abort the process, so no old scene may exist when the next scene is created.
 _ALIVE: WeakSet[Any] = WeakSet()
 
+# Variants of Mitsuba, the preferred one first.
+_VARIANTS = ("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
 
-def load_variant(prefer: str | None = None) -> str:
+
+def load_variant() -> str:
     """Choose CUDA if there is a GPU, else LLVM, and return the name of the variant.
 
-    Parameters
-    ----------
-    prefer : {"cuda", "llvm"}, optional
-        Required kind of variant.
+    A variant that is already set is kept, because a change would leave objects of two kinds alive.
 
     Raises
     ------
     UsageError
-        If Dr.Jit finds no device of that kind.
+        If Dr.Jit finds no device.
     SionnaMissingError
         If Sionna RT or a package that it needs is not installed, or no LLVM works.
     """
+    let_sionna_load()
+    without_llvm: SionnaMissingError | None = None
     try:
-        return _variant(("cuda", "llvm") if prefer is None else (prefer,))
+        prepare_llvm()  # call this before Dr.Jit searches for a library
+    except SionnaMissingError as error:
+        without_llvm = error  # a GPU does not need LLVM
+    try:
+        import drjit as dr
+        import mitsuba as mi
     except ImportError as error:
         raise _missing(error) from error
+    # Mitsuba searches the working folder first for plugins, which are native code, possibly from a third party
+    resolver: Any = mi.file_resolver
+    resolver().clear()
+    resolver().append(str(Path(mi.__file__).parent))
+    if mi.variant() not in _VARIANTS:
+        has_cuda = dr.has_backend(dr.JitBackend.CUDA)
+        if without_llvm and not has_cuda:
+            raise without_llvm
+        if not has_cuda and not dr.has_backend(dr.JitBackend.LLVM):
+            raise UsageError("Dr.Jit finds no device", cause="'aerpaw-cmp doctor' shows what is missing")
+        mi.set_variant(_VARIANTS[0 if has_cuda else 1])
+    return str(mi.variant())
 
 
 def _missing(error: ImportError) -> SionnaMissingError:
     if isinstance(error, ModuleNotFoundError):
         return SionnaMissingError(f"Sionna RT is not installed ({error}). Install it with: pip install sionna-rt")
     return SionnaMissingError(f"Sionna RT cannot be loaded ({error}). Repair it with: {INSTALL_AGAIN}")
-
-
-def _variant(kinds: Sequence[str]) -> str:
-    """Set the first of the kinds of variants that works, and return its name."""
-    let_sionna_load()
-    without_llvm: SionnaMissingError | None = None
-    if "llvm" in kinds:
-        try:
-            prepare_llvm()  # call this before Dr.Jit searches for a library
-        except SionnaMissingError as error:
-            without_llvm = error  # a GPU does not need LLVM
-    import mitsuba as mi
-
-    # Mitsuba searches the working folder first for plugins, which are native code, possibly from a third party
-    resolver: Any = mi.file_resolver
-    resolver().clear()
-    resolver().append(str(Path(mi.__file__).parent))
-    # keep a variant once it is set: changing it would leave objects of two kinds alive
-    current = mi.variant()
-    if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
-        return str(current)
-    import drjit as dr
-
-    for kind in kinds:
-        if kind == "llvm" and without_llvm:
-            raise without_llvm
-        if dr.has_backend(dr.JitBackend.CUDA if kind == "cuda" else dr.JitBackend.LLVM):
-            mi.set_variant(f"{kind}_ad_mono_polarized")
-            return str(mi.variant())
-    raise UsageError(
-        f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' shows what is missing"
-    )
 
 
 def free_memory() -> None:

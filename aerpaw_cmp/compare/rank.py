@@ -13,17 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
-from .statistics import (
-    FEWEST,
-    NO_INTERVAL,
-    SAME_PLACE_M,
-    Interval,
-    Visit,
-    independent_samples,
-    influence_interval,
-    same_places,
-    share_interval,
-)
+from . import statistics
 
 # Largest rank in histograms. The modems of AERPAW report RI 1 to 4.
 MAX_RANK = 4
@@ -311,7 +301,7 @@ class KCurve:
     k: FloatArray
     agreement: FloatArray
     best_k: float = float("nan")
-    best_k_ci95: Interval = NO_INTERVAL
+    best_k_ci95: statistics.Interval = statistics.NO_INTERVAL
 
 
 def k_curve(
@@ -347,10 +337,10 @@ def k_curve(
     # middle of the first run of best K, on the logarithmic scale of the grid
     first = int(np.argmax(agree))
     run = np.flatnonzero(np.append(agree[first:], -1.0) < agree[first] - 1e-12)[0]
-    ends = NO_INTERVAL
-    if len(equal) >= FEWEST:
+    ends = statistics.NO_INTERVAL
+    if len(equal) >= statistics.FEWEST:
         lost = (equal.astype(np.float64) - equal[:, first : first + 1]).T
-        alike = np.flatnonzero([influence_interval(loss.mean(), loss, place)[1] >= 0.0 for loss in lost])
+        alike = np.flatnonzero([statistics.influence_interval(loss.mean(), loss, place)[1] >= 0.0 for loss in lost])
         ends = float(grid[max(alike[0] - 1, 0)]), float(grid[min(alike[-1] + 1, len(grid) - 1)])
     return KCurve(k=grid, agreement=agree, best_k=float(np.sqrt(grid[first] * grid[first + run - 1])), best_k_ci95=ends)
 
@@ -455,16 +445,16 @@ class RankFit:
     """
 
     histogram: FloatArray
-    histogram_ci95: list[Interval]
+    histogram_ci95: list[statistics.Interval]
     out_of_coverage: int
     agreement: float
-    agreement_ci95: Interval
+    agreement_ci95: statistics.Interval
     kappa: float
-    kappa_ci95: Interval
+    kappa_ci95: statistics.Interval
     total_variation: float
-    total_variation_ci95: Interval
+    total_variation_ci95: statistics.Interval
     wasserstein: float
-    wasserstein_ci95: Interval
+    wasserstein_ci95: statistics.Interval
     confusion: IntArray
     p_histogram: float
 
@@ -493,7 +483,7 @@ class RankComparison:
     n_effective: float
     n_no_csi: int
     histogram: FloatArray
-    histogram_ci95: list[Interval]
+    histogram_ci95: list[statistics.Interval]
     simulated: Mapping[float, RankFit]
     curve: KCurve
     staleness: Staleness
@@ -548,7 +538,7 @@ def compare_rank(
     time = np.arange(len(ri)) if time_s is None else time_s
     return RankComparison(
         n=int(reported.sum()),
-        n_effective=independent_samples(ri[reported], place),
+        n_effective=statistics.independent_samples(ri[reported], place),
         n_no_csi=int((~reported).sum()),
         histogram=histogram(ri),
         histogram_ci95=_histogram_intervals(ri[reported], place),
@@ -558,8 +548,8 @@ def compare_rank(
     )
 
 
-def _histogram_intervals(rank: FloatArray, place_m: FloatArray | None = None) -> list[Interval]:
-    return [share_interval(bar, place_m, rank) for bar in one_hot(rank).T]
+def _histogram_intervals(rank: FloatArray, place_m: FloatArray | None = None) -> list[statistics.Interval]:
+    return [statistics.share_interval(bar, place_m, rank) for bar in one_hot(rank).T]
 
 
 def compare_ranks(measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray | None = None) -> RankFit:
@@ -613,7 +603,7 @@ class CommonestRank:
 
     rank: int
     agreement: float
-    agreement_ci95: Interval
+    agreement_ci95: statistics.Interval
 
 
 def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> CommonestRank:
@@ -630,7 +620,7 @@ def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> Co
     ri = _ranks(measured)
     bars = histogram(ri)
     if not np.isfinite(bars).all():
-        return CommonestRank(rank=0, agreement=float("nan"), agreement_ci95=NO_INTERVAL)
+        return CommonestRank(rank=0, agreement=float("nan"), agreement_ci95=statistics.NO_INTERVAL)
     best = int(np.argmax(bars))
     reported = np.isfinite(ri)
     bounds = _histogram_intervals(ri[reported], None if place_m is None else place_m[reported])[best]
@@ -652,12 +642,14 @@ class RankRepeat:
     """
 
     kappa: float
-    kappa_ci95: Interval
+    kappa_ci95: statistics.Interval
     agreement: float
     n: int
 
 
-def repeat_rank(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> RankRepeat:
+def repeat_rank(
+    first: statistics.Visit, second: statistics.Visit, radius_m: float = statistics.SAME_PLACE_M
+) -> RankRepeat:
     """Return the kappa of the ranks that two passes of a flight report at the same places.
 
     Parameters
@@ -673,25 +665,25 @@ def repeat_rank(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> 
         NaN without a pair.
     """
     ranks = [np.where(visit.value >= 1, visit.value, np.nan) for visit in (first, second)]
-    rows, partners = same_places(replace(first, value=ranks[0]), replace(second, value=ranks[1]), radius_m)
+    rows, partners = statistics.same_places(replace(first, value=ranks[0]), replace(second, value=ranks[1]), radius_m)
     if not len(rows):
-        return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
+        return RankRepeat(kappa=float("nan"), kappa_ci95=statistics.NO_INTERVAL, agreement=float("nan"), n=0)
     a, b = _pairs(ranks[0][rows], ranks[1][partners])
     kappa = cohen_kappa(a, b)
-    bounds = influence_interval(kappa, kappa_influence(a, b), first.position_m[rows], (-1.0, 1.0))
+    bounds = statistics.influence_interval(kappa, kappa_influence(a, b), first.position_m[rows], (-1.0, 1.0))
     return RankRepeat(kappa=kappa, kappa_ci95=bounds, agreement=agreement(a, b), n=len(a))
 
 
 def _pair_intervals(
     a: IntArray, b: IntArray, values: tuple[float, float, float, float], place_m: FloatArray | None = None
-) -> list[Interval]:
+) -> list[statistics.Interval]:
     """Return the intervals of agreement, kappa, total variation and Wasserstein distance of paired ranks (n,)."""
-    if len(a) < FEWEST:
-        return [NO_INTERVAL] * 4
+    if len(a) < statistics.FEWEST:
+        return [statistics.NO_INTERVAL] * 4
     equal, *influences = _influences((a == b).astype(np.float64), one_hot(a), one_hot(b))
     # Wilson's interval for the agreement, because it has a width even at shares of 0 and 1
-    return [share_interval(equal, place_m, a.astype(np.float64))] + [
-        influence_interval(value, influence, place_m, bounds)
+    return [statistics.share_interval(equal, place_m, a.astype(np.float64))] + [
+        statistics.influence_interval(value, influence, place_m, bounds)
         for value, influence, bounds in zip(
             values[1:], influences, ((-1.0, 1.0), (0.0, 1.0), (0.0, MAX_RANK - 1.0)), strict=True
         )

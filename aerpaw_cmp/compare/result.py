@@ -17,17 +17,9 @@ from typing import Any
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, db_from_amplitude
+from . import level
 from .gains import StatedSpread
 from .ladder import ModelRow
-from .level import (
-    LEARNED_HERE,
-    ChannelDifference,
-    DetectionScore,
-    ErrorSpan,
-    FieldAudit,
-    RssComparison,
-    ServingComparison,
-)
 from .offset import OffsetFit
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .receiver import ForecastScore
@@ -180,7 +172,7 @@ class RssFurther:
     baseline_rmse_ci95_db: Mapping[str, Interval]
     compared_with: Mapping[str, PairedDifference]
     averaged: Mapping[str, Mapping[str, OffsetFit]]
-    detection: DetectionScore | None = None
+    detection: level.DetectionScore | None = None
     snr: SnrScore | None = None
     rmse_bound: str | None = None
     interval_notes: tuple[str, ...] | None = None
@@ -232,9 +224,9 @@ class RssResult:
     position_m: FloatArray
     line_of_sight: FloatArray
     geometry: Mapping[str, FloatArray]
-    score: RssComparison
+    score: level.RssComparison
     baselines: Mapping[str, ModelLevel]
-    spans: tuple[ErrorSpan, ...]
+    spans: tuple[level.ErrorSpan, ...]
     further: RssFurther
     stated: StatedSpread | None = None
     tower_m: FloatArray | None = None
@@ -272,7 +264,7 @@ class RssResult:
     @property
     def residual_db(self) -> FloatArray:
         """Measurement plus offset minus simulation (n,). NaN if either is missing, and for a training flight."""
-        if LEARNED_HERE in self.score.fitted_on_scored:
+        if level.LEARNED_HERE in self.score.fitted_on_scored:
             # a series is not scored on its own training data
             return np.full(len(self.time), np.nan)
         return self.calibrated_db - self.simulated_dbm
@@ -286,7 +278,7 @@ class PairResult:
     first: str
     second: str
     time: AnyArray
-    score: ChannelDifference
+    score: level.ChannelDifference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -384,7 +376,7 @@ class AuditResult:
     seconds: float = float("nan")
     reference_seconds: float = float("nan")
     note: str = ""
-    fields: FieldAudit | None = None
+    fields: level.FieldAudit | None = None
     read_from_cache_of: str = ""
 
 
@@ -442,7 +434,7 @@ class FlightResult:
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
-    serving: ServingComparison | None = None
+    serving: level.ServingComparison | None = None
     models: tuple[ModelRow, ...] = ()
     ladder: tuple[ModelRow, ...] = ()
     verdict: FlightVerdict | None = None

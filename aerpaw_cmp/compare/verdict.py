@@ -28,18 +28,6 @@ from .level import DetectionScore, floored_fit
 from .offset import SPAN_DB, nearest_offset, offset_grid
 from .rank import MAX_RANK, agreement, cohen_kappa, kappa_influence
 from .result import FlightVerdict, RssResult
-from .statistics import (
-    FEWEST,
-    NO_INTERVAL,
-    Interval,
-    corrected,
-    is_flat,
-    mean_interval,
-    middle_span,
-    paired_verdict,
-    pooled_difference,
-    spread_interval,
-)
 
 
 def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
@@ -49,7 +37,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
         members = [i for i, row in enumerate(rows) if name in row]
         # count copies of a log on several channels once
         measured = [panels[i].measured_db.tobytes() for i in members]
-        for i, pair in zip(members, corrected([rows[i][name] for i in members], measured), strict=True):
+        for i, pair in zip(members, statistics.corrected([rows[i][name] for i in members], measured), strict=True):
             rows[i][name] = pair
     return [
         replace(panel, further=replace(panel.further, compared_with=row))
@@ -60,7 +48,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
     """Return channels with an offset and enough samples, without copies and (if any has a signal) dead channels."""
     some = [p for p in without_copies(panels) if not p.score.at_edge]
-    enough = [p for p in some if p.score.n >= FEWEST and math.isfinite(p.score.rmse_db)]
+    enough = [p for p in some if p.score.n >= statistics.FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
 
 
@@ -79,14 +67,16 @@ def is_dead(panel: RssResult) -> bool:
     if not known.any():
         return False
     measured_db = panel.measured_db[known]
-    return middle_span(measured_db) < _DEAD_DB and is_flat(measured_db, [panel.simulated_dbm[known]])
+    return statistics.middle_span(measured_db) < _DEAD_DB and statistics.is_flat(
+        measured_db, [panel.simulated_dbm[known]]
+    )
 
 
 def is_one_place(panels: Iterable[RssResult]) -> bool:
     """Check whether no model predicts a change of 1 dB, as in a hover. Then all models fit like a constant."""
     every = [[panel.simulated_dbm, *(b.level_dbm for b in panel.baselines.values())] for panel in scored(panels)]
     levels = [level[np.isfinite(level)] for models in every for level in models if np.isfinite(level).any()]
-    return bool(levels) and max(map(middle_span, levels)) < _DEAD_DB
+    return bool(levels) and max(map(statistics.middle_span, levels)) < _DEAD_DB
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
@@ -124,7 +114,7 @@ def flight_verdict(panels: Sequence[RssResult]) -> FlightVerdict | None:
         return None
     channels = [(panel.time, of[_RAY], of[best]) for panel, of in zip(panels, residuals, strict=True)]
     places = [panel.position_m for panel in panels]
-    pair = pooled_difference(channels, free_offset=not any(map(lock_lost, panels)), place_m=places)
+    pair = statistics.pooled_difference(channels, free_offset=not any(map(lock_lost, panels)), place_m=places)
     return FlightVerdict(
         against=best, rmse_db=errors[_RAY], baseline_rmse_db=errors[best], difference_db=pair.difference_db,
         ci95_db=pair.difference_ci95_db, channels=len(panels),
@@ -312,7 +302,7 @@ class Verdict:
 
     cause: str = NONE
     effect: float = math.nan
-    interval: Interval = NO_INTERVAL
+    interval: statistics.Interval = statistics.NO_INTERVAL
     where: str = ""
 
 
@@ -380,19 +370,19 @@ def _shifts(
         yield chance, Verdict(cause="outlying offset", effect=effect, interval=ends, where=flown[i])
 
 
-def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, Interval]]:
+def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, statistics.Interval]]:
     """Compare each value with all others."""
     for i in range(len(values)):
         yield i, *_split(values, np.arange(len(values)) == i)
 
 
-def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interval]:
+def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, statistics.Interval]:
     """Return p-value, difference of means (inside minus outside) and its 95 % interval, with pooled variance."""
     from scipy.special import stdtr, stdtrit  # importing scipy.stats would take 0.2 s for two functions
 
     freedom, n = len(values) - 2, int(inside.sum())
     if len(values) < _FEWEST_TO_COMPARE or not 0 < n < len(values):
-        return math.nan, math.nan, NO_INTERVAL
+        return math.nan, math.nan, statistics.NO_INTERVAL
     within, without = values[inside], values[~inside]
     effect = float(within.mean() - without.mean())
     square = float(((within - within.mean()) ** 2).sum() + ((without - without.mean()) ** 2).sum()) / freedom
@@ -426,7 +416,10 @@ def by_flight(
     first, second = _means(errors_db), _means(other_db)
     mean = mean_of_flights([first[name] - second[name] for name in first if name in second])
     return Verdict(
-        cause=paired_verdict(mean.low, mean.high), effect=mean.mean, interval=(mean.low, mean.high), where=where
+        cause=statistics.paired_verdict(mean.low, mean.high),
+        effect=mean.mean,
+        interval=(mean.low, mean.high),
+        where=where,
     )
 
 
@@ -501,14 +494,14 @@ def stated_errors(
     """
     good = np.isfinite(error_db) & np.isfinite(sd_db) & (sd_db > 0.0)
     error, sd, place = error_db[good], sd_db[good], None if place_m is None else place_m[good]
-    if len(error) < FEWEST:
+    if len(error) < statistics.FEWEST:
         return Verdict(cause="no interval")
     share = float(np.mean(np.square(np.broadcast_to(common_db, good.shape)[good])))
-    mean, ends = float(error.mean()), mean_interval(error, place)
+    mean, ends = float(error.mean()), statistics.mean_interval(error, place)
     reach = math.hypot(0.5 * (ends[1] - ends[0]), 1.96 * math.sqrt(share))
     bias = Verdict(cause="biased", effect=mean, interval=(mean - reach, mean + reach))
     ratio = error / sd
-    low, high = spread_interval(ratio, place)
+    low, high = statistics.spread_interval(ratio, place)
     # An error that is common to the flight does not spread the errors within it. It can hide that an interval is too
     # narrow, but cannot make it look too wide.
     allowed = share / float(np.mean(sd**2))
@@ -598,7 +591,7 @@ class Step:
     night: str
     shown: str
     step_db: float
-    step_ci95_db: Interval
+    step_ci95_db: statistics.Interval
     back: str = ""
 
 
@@ -964,7 +957,7 @@ def _changed(
 ) -> Changed:
     """Return the change of a statistic. ``added`` (n,) contains the contribution of each sample, for the interval."""
     change = second - first
-    ends = NO_INTERVAL if added is None else statistics.influence_interval(change, added, place_m)
+    ends = statistics.NO_INTERVAL if added is None else statistics.influence_interval(change, added, place_m)
     return Changed(first=first, second=second, difference=change, ci95=ends)
 
 

@@ -21,17 +21,7 @@ from ..common.errors import InputError, UsageError
 from ..common.geodesy import azimuth_rad, elevation_rad
 from ..common.units import FloatArray, wavelength_m
 from ..compare.gains import NO_SPREAD, Spread, link_directions
-from ..propagation.field.foliage import (
-    LEAFLESS_FACTOR,
-    P833,
-    P833_TABLE,
-    crown_index,
-    foliage_depth_m,
-    foliage_loss_db,
-    foliage_model,
-    stand_depth_m,
-    stand_loss_db,
-)
+from ..propagation.field import foliage
 from ..propagation.geometry import Link, PathSet, Pattern, Poses, single_element
 from ..propagation.options import Loss, Run, Search
 from ..propagation.replay import replay
@@ -147,7 +137,7 @@ def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
         return None
     site = site.under(rt.foliage)
     model, evergreen = (
-        foliage_model(
+        foliage.foliage_model(
             rt.foliage,
             carrier_hz,
             in_leaf=in_leaf,
@@ -156,13 +146,13 @@ def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
         )
         for in_leaf in (rt.leaves == "in", True)
     )
-    index, wavelength = crown_index(site.trees), wavelength_m(carrier_hz)
+    index, wavelength = foliage.crown_index(site.trees), wavelength_m(carrier_hz)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]
         # a path passes single trees and woods one after the other, so their losses add
-        trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model)
-        return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength, evergreen)
+        trees_db = foliage.foliage_loss_db(source, paths.vertices_m, target, index, model)
+        return trees_db + foliage.stand_loss_db(site, source, paths.vertices_m, target, model, wavelength, evergreen)
 
     return loss
 
@@ -273,8 +263,8 @@ def sight_shares(site: Site, tower: str, poses_m: FloatArray) -> tuple[float, fl
 def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, site: Site) -> FloatArray:
     """Return the length (n,) [m] inside crowns and woods of lines from a tower (3,) or (n, 3) to poses (n, 3) [m]."""
     source = np.broadcast_to(tower_m, poses_m.shape)
-    in_crowns = foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, site.trees)
-    return in_crowns + stand_depth_m(site, source, poses_m)
+    in_crowns = foliage.foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, site.trees)
+    return in_crowns + foliage.stand_depth_m(site, source, poses_m)
 
 
 def load_with_learned(path: str | Path, learned: Path | None = None, overrides: Overrides | None = None) -> FlightFile:
@@ -442,18 +432,18 @@ def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) 
         notes += [note for carrier in sorted(carriers_hz) if (note := p833_note(carrier))]
     if rt.leaves == "out":
         notes.append(
-            f"Trees out of leaf: gamma in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
-            "tool: ITU-R P.833 states about 20 % near 1 GHz, and no value at this carrier."
+            f"Trees out of leaf: gamma in leaf divided by {1 / foliage.LEAFLESS_FACTOR:g}. That is an assumption of "
+            "this tool: ITU-R P.833 states about 20 % near 1 GHz, and no value at this carrier."
         )
     return tuple(notes)
 
 
 def p833_note(carrier_hz: float) -> str | None:
     """Return the note that the table of P.833 is extrapolated, or None if the carrier is within the table."""
-    low, high = P833_TABLE[0][0], P833_TABLE[-1][0]
+    low, high = foliage.P833_TABLE[0][0], foliage.P833_TABLE[-1][0]
     if low <= carrier_hz / 1e6 <= high:
         return None
-    model = P833.at(carrier_hz)
+    model = foliage.P833.at(carrier_hz)
     return (
         f"Trees at {carrier_hz / 1e9:g} GHz: an extrapolation of ITU-R P.833, whose table of woodland covers {low:g} "
         f"to {high:g} MHz. Beyond it, gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "

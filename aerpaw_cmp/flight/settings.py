@@ -24,15 +24,7 @@ from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, carrier_fault, noise_
 from ..common.yamlfile import StrictModel, expectation, load_yaml, nearest, nearest_zone
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
-from ..propagation.geometry import (
-    Array,
-    Link,
-    Pattern,
-    linear_array,
-    rotation_from_yaw_pitch_roll,
-    tower_comparison_array,
-    uav_comparison_array,
-)
+from ..propagation import geometry
 from ..propagation.options import Diffraction
 from ..site.antennas import Isotropic
 from ..site.learned import BAND, LearnedAntenna, Written, check_band, read_pair, read_sphere_csv
@@ -116,12 +108,12 @@ class ArraySettings(StrictModel):
                 raise UsageError("layout 'custom' without 'positions_m'", expected="a list of [x, y, z] in metres")
             return np.asarray(self.positions_m, dtype=np.float64)
         if self.layout == "uav_comparison":
-            return uav_comparison_array(wavelength).positions_m
+            return geometry.uav_comparison_array(wavelength).positions_m
         if self.layout == "tower_comparison":
-            return tower_comparison_array().positions_m
-        return linear_array(1 if self.layout == "single" else self.elements or 4, wavelength / 2).positions_m
+            return geometry.tower_comparison_array().positions_m
+        return geometry.linear_array(1 if self.layout == "single" else self.elements or 4, wavelength / 2).positions_m
 
-    def build(self, wavelength: float, folder: Path) -> Array:
+    def build(self, wavelength: float, folder: Path) -> geometry.Array:
         """Return the array, with patterns loaded from files relative to ``folder``."""
         positions = self.positions(wavelength)
         # one slant for all elements, or one per element
@@ -130,10 +122,10 @@ class ArraySettings(StrictModel):
             raise UsageError(
                 f"{len(slant)} slants for {len(positions)} elements", expected="one slant, or one per element"
             )
-        mount = rotation_from_yaw_pitch_roll(
+        mount = geometry.rotation_from_yaw_pitch_roll(
             np.radians(self.yaw_deg), np.radians(self.pitch_deg), np.radians(self.roll_deg)
         )
-        return Array(
+        return geometry.Array(
             positions,
             np.radians(np.broadcast_to(slant, (len(positions),)).copy()),
             # one pattern for all elements; the carrier selects the frequency in a measured file
@@ -142,7 +134,7 @@ class ArraySettings(StrictModel):
         )
 
 
-def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | None = None) -> Pattern:
+def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | None = None) -> geometry.Pattern:
     """Return the element pattern. Files are relative to ``folder``, and the carrier selects the frequency."""
     from ..site import antennas
 
@@ -167,7 +159,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     return Isotropic()
 
 
-def _sphere(settings: AntennaSettings, file: Path, folder: Path) -> Pattern:
+def _sphere(settings: AntennaSettings, file: Path, folder: Path) -> geometry.Pattern:
     """Return the pattern of a full sphere. If it is learned, check its SHA-256 and attach its error model."""
     known = settings.learned
     if known is None:
@@ -209,11 +201,11 @@ class LinkSettings(StrictModel):
         """The noise floor of the receiver [dBm] in its bandwidth, or in 1 Hz if the bandwidth is unknown."""
         return noise_floor_dbm(self.bandwidth_hz or 1.0, self.noise_figure_db or 0.0)
 
-    def build(self, tower_names: list[str], folder: Path) -> Link:
+    def build(self, tower_names: list[str], folder: Path) -> geometry.Link:
         """Return the link to the named towers."""
         wavelength = wavelength_m(self.carrier_hz)
         arrays = {name: self.towers.get(name, self.tower).build(wavelength, folder) for name in tower_names}
-        return Link(
+        return geometry.Link(
             carrier_hz=self.carrier_hz,
             transmit_power_dbm=self.transmit_power_dbm,
             uav_transmits=self.uav_transmits,

@@ -26,23 +26,7 @@ from ..logs.records import has_wall_clock
 from ..report.calibration import AntennaMap, CalibrationData, calibration_metrics, write_calibration
 from ..report.page import write_file
 from ..report.texts import safe_name
-from ..site.learned import (
-    Entry,
-    Errors,
-    LearnedAntenna,
-    LearnedLevel,
-    LearnedLock,
-    LearnedPair,
-    LearnedReceiver,
-    LearnedSeries,
-    LearnedSpread,
-    PairGain,
-    SpherePattern,
-    planning_cuts,
-    sphere_csv,
-    sphere_grid,
-    unit_mean_gain,
-)
+from ..site import learned
 from .calibrate import Calibration, CalibrationFile, direction_covariance
 from .calibrate_rank import RankCalibration
 
@@ -55,7 +39,7 @@ _PAIR_SHARE, _MOST_PAIRS = 0.01, 400
 
 def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
     """Return the gain over the sphere of every antenna, by ``(tower.channel, "uav" or "tower")``."""
-    theta, azimuth, vectors = sphere_grid()
+    theta, azimuth, vectors = learned.sphere_grid()
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
     fit, out = calibration.fit, {}
     for antenna in fit.antennas:
@@ -63,7 +47,7 @@ def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]
         for end, frame, name in ends:
             gain, sd = fit.gain(frame, antenna, flat)
             raw = (gain + calibration.learned.pattern_db(name, flat)).reshape(shape)
-            gain_dbi = unit_mean_gain(raw)
+            gain_dbi = learned.unit_mean_gain(raw)
             out[antenna, end] = AntennaMap(
                 name=f"{antenna} {end}",
                 theta_deg=theta,
@@ -100,12 +84,12 @@ def _antenna_files(
     out: dict[str, str] = {}
     for (antenna, end), gains in maps.items():
         stem = safe_name(f"{antenna}.{end}")
-        out[f"{stem}.csv"] = sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_provenance_notes(calibration)))
+        out[f"{stem}.csv"] = learned.sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_provenance_notes(calibration)))
         pair = _pair_gain(calibration, antenna) if end == "tower" else None
         if pair is not None:
             out[f"{safe_name(f'{antenna}.pair')}.csv"] = pair.table((*notes[:1], *_provenance_notes(calibration)))
-        pattern = SpherePattern(stem, gains.gain_dbi, gains.sd_db)
-        out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz, _provenance_notes(calibration))
+        pattern = learned.SpherePattern(stem, gains.gain_dbi, gains.sd_db)
+        out[f"{stem}.msi"] = learned.planning_cuts(pattern, stem, carrier_hz, _provenance_notes(calibration))
     return out
 
 
@@ -114,14 +98,14 @@ def _provenance_notes(calibration: Calibration) -> Sequence[str]:
     return f"{KEY}: {' '.join(calibration.trained_on)}", f"{MARKS}: {' '.join(calibration.marks)}"
 
 
-def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
+def _pair_gain(calibration: Calibration, antenna: str) -> learned.PairGain | None:
     """Return the joint gain of an antenna and the UAV, or None if it was not learned."""
     fit = calibration.fit
     if (term := calibration.pair_term) is None:
         return None
     flown, length = fit.seen("pair", antenna), term.length
     at = flown[determining(flown, lambda a, b: gaussian_kernel(a, b, length), _PAIR_SHARE, _MOST_PAIRS)]
-    return PairGain(
+    return learned.PairGain(
         directions=at,
         gain_db=fit.gain("pair", antenna, at)[0],
         sd_db=fit.predict(directed(antenna, at), ("body", "mast", "pair"))[1],
@@ -140,17 +124,17 @@ def _learned_antenna(
 
     file, pair_file = (safe_name(f"{antenna}.{part}") + ".csv" for part in (end, "pair"))
     pair, spread = calibration.pair_term if end == "tower" else None, calibration.learned.spread(antenna)
-    both = None if pair is None else LearnedPair(
+    both = None if pair is None else learned.LearnedPair(
         file=f"{place}/{pair_file}", sha256=sha256(pair_file), length=pair.length, prior_sd_db=_rounded(pair.sd_db)
     )  # fmt: skip
-    known = LearnedAntenna(sha256=sha256(file), command=command, pair=both, spread=rounded_spread(spread))
-    learned = known.model_dump(exclude_none=True)
-    return {"antenna": {"model": "sphere", "file": f"{place}/{file}", "learned": learned}}
+    known = learned.LearnedAntenna(sha256=sha256(file), command=command, pair=both, spread=rounded_spread(spread))
+    content = known.model_dump(exclude_none=True)
+    return {"antenna": {"model": "sphere", "file": f"{place}/{file}", "learned": content}}
 
 
-def rounded_spread(spread: Spread) -> LearnedSpread:
+def rounded_spread(spread: Spread) -> learned.LearnedSpread:
     """Return an error model rounded to four digits, as it is written to files."""
-    return LearnedSpread(**{name: _rounded(value) for name, value in dataclasses.asdict(spread).items()})
+    return learned.LearnedSpread(**{name: _rounded(value) for name, value in dataclasses.asdict(spread).items()})
 
 
 def _rounded(value: float) -> float:
@@ -306,14 +290,14 @@ def write_files(
     return metrics, "".join(f"{line}\n" for line in head) + dump_yaml({**content, MARKS: list(marks)})
 
 
-def site_entries(calibrated: Calibrated) -> dict[str, tuple[Entry, dict[str, bytes]]]:
+def site_entries(calibrated: Calibrated) -> dict[str, tuple[learned.Entry, dict[str, bytes]]]:
     """Return the entries for the learned models of a site, by campaign. Each has its tables by name."""
     settings, out = calibrated.settings, {}
     maps = None if calibrated.calibration is None else _antenna_maps(calibrated.calibration)
     for name, campaign in settings.by_campaign().items():
         flights = [f for f in calibrated.flights if calibrated.campaigns[f.settings.flight.name] == name]
         begins = [s.time.min() for data in flights for _, s in data.series]
-        made = Entry(
+        made = learned.Entry(
             command=calibrated.command,
             made=datetime.now(timezone.utc).date().isoformat(),
             flights=[data.settings.flight.name for data in flights],
@@ -337,7 +321,7 @@ def site_entries(calibrated: Calibrated) -> dict[str, tuple[Entry, dict[str, byt
 
 def _learned_series(
     calibration: Calibration, name: str, maps: Mapping[tuple[str, str], AntennaMap]
-) -> tuple[list[LearnedSeries], dict[str, bytes]]:
+) -> tuple[list[learned.LearnedSeries], dict[str, bytes]]:
     """Return the antennas of all towers and channels of a campaign, and their tables by name."""
     tables: dict[str, bytes] = {}
     series = []
@@ -353,7 +337,7 @@ def _learned_series(
         notes |= {part: notes[part][:2] for part in ("known", "tower_known", "pair")}
         for end in ("tower", "uav"):
             gains = maps[parts[end], end]
-            content = sphere_csv(gains.gain_dbi, gains.sd_db, notes[end], decimals=2)
+            content = learned.sphere_csv(gains.gain_dbi, gains.sd_db, notes[end], decimals=2)
             tables.setdefault(files[end], content.encode())
         if files["known"] not in tables:
             tables[files["known"]] = direction_covariance(calibration.fit, antenna).table(notes["known"]).encode()
@@ -362,11 +346,11 @@ def _learned_series(
         both = None
         if (pair := _pair_gain(calibration, antenna)) is not None:
             tables[files["pair"]] = pair.table(notes["pair"]).encode()
-            both = LearnedPair(file=files["pair"], length=pair.length, prior_sd_db=_rounded(pair.prior_sd_db))
+            both = learned.LearnedPair(file=files["pair"], length=pair.length, prior_sd_db=_rounded(pair.prior_sd_db))
         (data, first), ends = calibration.first_series(antenna), (maps[shared, "uav"], maps[antenna, "tower"])
         sds = np.concatenate([calibration.learned.predict(s.part(spread_out(len(s), _SD_SAMPLES)))[1] for s in samples])
         series.append(
-            LearnedSeries(
+            learned.LearnedSeries(
                 tower=samples[0].tower,
                 channel=samples[0].channel,
                 receiver=data.settings.logs[int(first.log[0])].receiver,
@@ -391,7 +375,7 @@ def _learned_series(
 _SD_SAMPLES = 200
 
 
-def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
+def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> learned.LearnedLevel | None:
     """Return the mean level of the flights relative to the written antennas, with its error on held-out flights."""
     mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
     if mine[0].samples.antenna in calibration.locks:  # without lock, levels do not depend on the path
@@ -406,7 +390,7 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
     n = max(len(squares), 1)
     # the difference from the mean of the n - 1 other flights is n / (n - 1) times that from the mean of all n
     between_db = offset_sd_db((1.0 - 1.0 / n) ** 2 * sum(squares), n - 1)
-    return LearnedLevel(
+    return learned.LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
         sd_db=round(math.sqrt(1.0 + 1.0 / n) * between_db, 2),
         transmit_power_dbm=sent,
@@ -414,14 +398,16 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
     )
 
 
-def _at_unit_gain(lock: LearnedLock | None, *ends: AntennaMap) -> LearnedLock | None:
+def _at_unit_gain(lock: learned.LearnedLock | None, *ends: AntennaMap) -> learned.LearnedLock | None:
     """Return the lock model for levels predicted with the written antennas."""
     if lock is None:
         return None
     return lock.model_copy(update={"gain_db": round(lock.gain_db - sum(end.level_db for end in ends), 2)})
 
 
-def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, file: str) -> list[LearnedReceiver]:
+def _learned_receivers(
+    flights: Sequence[FlightData], ranked: RankCalibration, file: str
+) -> list[learned.LearnedReceiver]:
     """Return the fitted receivers with their scores on held-out flights."""
     receivers = []
     for tower in ranked.receivers:
@@ -434,12 +420,14 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
         }
         link = first[0].settings.link.rank
         receivers.append(
-            LearnedReceiver(tower=tower, quantity=quantity_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
+            learned.LearnedReceiver(
+                tower=tower, quantity=quantity_of(*first), carrier_hz=link.carrier_hz, file=file, **means
+            )
         )
     return receivers
 
 
-def _errors(calibration: Calibration, name: str) -> Errors | None:
+def _errors(calibration: Calibration, name: str) -> learned.Errors | None:
     """Return the errors on held-out flights and held-out parts of a campaign, or None without held-out flights."""
 
     def mine(split: str) -> list[Score]:
@@ -454,7 +442,7 @@ def _errors(calibration: Calibration, name: str) -> Errors | None:
     parts = {key: mine(f"{split}_left_out") for key, split in _PARTS.items()}
     values |= {f"{key}_rmse_db": round(mean_rmse(some), 3) for key, some in parts.items() if some}
     heights = {cruise_height_m(o) for o in calibration.observed if calibration.campaigns[o.samples.flight] == name}
-    return Errors(series=len(scores), heights_m=sorted(heights), **values)
+    return learned.Errors(series=len(scores), heights_m=sorted(heights), **values)
 
 
 # Split by the prefix of its error. For "airframe", only the airframe of other campaigns is used.

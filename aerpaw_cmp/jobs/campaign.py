@@ -42,15 +42,7 @@ from ..flight.training import among, logs_of, series_mark
 from ..logs.ingest import ingest
 from ..logs.readers import ReadOptions
 from ..logs.records import has_wall_clock
-from ..report.campaign import (
-    CampaignData,
-    CampaignSummary,
-    Failure,
-    RankRow,
-    RankTransfer,
-    RssRow,
-    SettingRank,
-)
+from ..report import campaign as page
 from .flight_run import run_flight
 from .options import DEFAULT, RunOptions
 from .tasks import OutcomeStore, stamp, task_inputs, task_key
@@ -82,9 +74,9 @@ class Task:
 class Outcome:
     """The rows of one task or its failure, and its computing time [s]."""
 
-    rss: tuple[RssRow, ...] = ()
-    rank: tuple[RankRow, ...] = ()
-    failure: Failure | None = None
+    rss: tuple[page.RssRow, ...] = ()
+    rank: tuple[page.RankRow, ...] = ()
+    failure: page.Failure | None = None
     seconds: float = 0.0
 
 
@@ -97,7 +89,7 @@ def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Out
     marked: dict[str, str] = {}
     counted = []
     for task, outcome in zip(tasks, outcomes, strict=True):
-        rows: list[RssRow | RankRow] = [*outcome.rss, *outcome.rank]
+        rows: list[page.RssRow | page.RankRow] = [*outcome.rss, *outcome.rank]
         again = sorted({log for row in rows for log in row.logs if home.setdefault(log, task.flight) != task.flight})
         message = f"the same log as {home[again[0]]} (SHA-256 {again[0][:12]}...)" if again else ""
         marks = {row.mark for row in rows if row.mark}
@@ -169,7 +161,7 @@ def run_task(task: Task) -> Outcome:
 def failed_task(task: Task, message: str, error: BaseException | None = None) -> Outcome:
     """Return the outcome of a failed task: its message, and the traceback for a separate file."""
     text = "" if error is None else "".join(traceback.format_exception(error))
-    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
+    return Outcome(failure=page.Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
 
 
 # --- tasks of a worker --------------------------------------------------------------------------------------------
@@ -216,7 +208,7 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
     """
     names = {"flight": task.flight, "setting": task.setting}
 
-    def row(stored: RssRow) -> RssRow:
+    def row(stored: page.RssRow) -> page.RssRow:
         named = dataclasses.replace(stored, **names)  # type: ignore[arg-type]
         if task.reference:
             return named
@@ -235,12 +227,12 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 # --- rows -----------------------------------------------------------------------------------------------------------
 
 
-def _rss_row(task: Task, data: FlightData, result: RssResult, series: RssSeries) -> RssRow:
+def _rss_row(task: Task, data: FlightData, result: RssResult, series: RssSeries) -> page.RssRow:
     """Return the row of a channel. Its log is identified by content, regardless of name and packing."""
     score, clock = result.score, result.further.clock
     # exclude a flight from pooling and ranking if its antennas were learned from its own log
     measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
-    return RssRow(
+    return page.RssRow(
         flight=task.flight,
         setting=task.setting,
         tower=result.tower, channel=result.channel, unit=result.unit, simulated_dbm=result.simulated_dbm,
@@ -268,11 +260,11 @@ def _rss_row(task: Task, data: FlightData, result: RssResult, series: RssSeries)
     )  # fmt: skip
 
 
-def _rank_rows(task: Task, data: FlightData, result: RankResult, series: RankSeries) -> list[RankRow]:
+def _rank_rows(task: Task, data: FlightData, result: RankResult, series: RankSeries) -> list[page.RankRow]:
     """Return a row for each K of a tower."""
     score = result.score
     return [
-        RankRow(
+        page.RankRow(
             flight=task.flight,
             setting=task.setting,
             tower=result.tower,
@@ -416,7 +408,7 @@ def run(
     *,
     keep: Path | None = None,
     stages: Stages | None = None,
-) -> CampaignData:
+) -> page.CampaignData:
     """Run all flights under all settings, and compute the numbers that need several flights.
 
     Parameters
@@ -464,7 +456,7 @@ def run(
         rows = [row for o in results for row in o.rss]
         repeated = repeats([r for r in rows if r.setting == next(iter(settings))])
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
-    return CampaignData(
+    return page.CampaignData(
         name=campaign.campaign,
         title=campaign.title or campaign.campaign,
         flights=tuple(dict.fromkeys([*files, *(f.flight for f in failures)])),
@@ -482,7 +474,7 @@ def run(
 
 def campaign_tasks(
     campaign: CampaignFile, folder: Path, logs_root: Path | None = None
-) -> tuple[list[Task], dict[str, tuple[Path, FlightFile]], list[Failure]]:
+) -> tuple[list[Task], dict[str, tuple[Path, FlightFile]], list[page.Failure]]:
     """Return one task per setting and flight, the flight files by name, and the files that cannot be read.
 
     Raises
@@ -509,7 +501,7 @@ def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | N
 
 def _flight_files(
     campaign: CampaignFile, folder: Path, settings: Mapping[str, Overrides]
-) -> tuple[dict[str, tuple[Path, FlightFile]], list[Failure]]:
+) -> tuple[dict[str, tuple[Path, FlightFile]], list[page.Failure]]:
     """Return the readable flight files by name, with all overrides checked, and the failures of other files."""
     files: dict[str, tuple[Path, FlightFile]] = {}
     failures = []
@@ -519,7 +511,7 @@ def _flight_files(
             flight = load_flight(path)
             with_learned(flight, path.parent)
         except (InputError, UsageError) as error:
-            failures.append(Failure(flight=Path(entry).stem, setting="every setting", message=str(error)))
+            failures.append(page.Failure(flight=Path(entry).stem, setting="every setting", message=str(error)))
             continue
         name = flight.flight.name
         if name in files:
@@ -538,7 +530,7 @@ def _flight_files(
 # --- numbers of several flights: repeatability, K chosen on the other flights ----------------------------------------
 
 
-def repeats(rows: Sequence[RssRow]) -> list[PassPair]:
+def repeats(rows: Sequence[page.RssRow]) -> list[PassPair]:
     """Compare every pair of flights with a common tower and channel. ``rows`` are those of one setting."""
     passes = [
         Pass(
@@ -552,15 +544,15 @@ def repeats(rows: Sequence[RssRow]) -> list[PassPair]:
         )
         for row in rows
     ]
-    rule = {"radius_m": CampaignData.radius_m, "heading_within_deg": CampaignData.heading_within_deg}
-    return pass_pairs(passes, cell_m=CampaignData.cell_m, **rule)
+    rule = {"radius_m": page.CampaignData.radius_m, "heading_within_deg": page.CampaignData.heading_within_deg}
+    return pass_pairs(passes, cell_m=page.CampaignData.cell_m, **rule)
 
 
-def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
+def transfer_ranks(rows: Sequence[page.RankRow]) -> list[page.RankTransfer]:
     """Choose K for each flight from the other flights with the same tower and values of K."""
     out = []
     for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
-        by: dict[str, dict[float, RankRow]] = {}
+        by: dict[str, dict[float, page.RankRow]] = {}
         for row in rows:
             if (row.setting, row.tower) == (setting, tower) and np.isfinite(row.total_variation):
                 by.setdefault(row.flight, {})[row.k] = row
@@ -573,7 +565,7 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
             chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in other_flights]))
             best = min(fits, key=lambda k: fits[k].total_variation)
             out.append(
-                RankTransfer(
+                page.RankTransfer(
                     setting=setting,
                     flight=flight,
                     tower=tower,
@@ -589,8 +581,8 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
 
 
 def with_season(
-    data: CampaignData, reports: Mapping[str, str] | None = None, sounded: Sequence[NodeOffset] = ()
-) -> CampaignData:
+    data: page.CampaignData, reports: Mapping[str, str] | None = None, sounded: Sequence[NodeOffset] = ()
+) -> page.CampaignData:
     """Return the campaign with held-out errors in its rows, and its numbers over several flights.
 
     Parameters
@@ -602,7 +594,7 @@ def with_season(
         Node offsets from tower-to-tower soundings (:func:`soundings`). They replace the offsets of the flights.
     """
     rows = _held_out_rows(data.rss)
-    season = CampaignSummary(reports=dict(reports or {}), nodes=tuple(sounded))
+    season = page.CampaignSummary(reports=dict(reports or {}), nodes=tuple(sounded))
     if not rows:
         return dataclasses.replace(data, season=season)
     data = dataclasses.replace(data, rss=tuple(rows))
@@ -619,7 +611,7 @@ def with_season(
     return dataclasses.replace(data, season=season)
 
 
-def _started_of(rows: Iterable[RssRow]) -> dict[str, int]:
+def _started_of(rows: Iterable[page.RssRow]) -> dict[str, int]:
     """Return the start of each flight [ns after 1970-01-01]. A flight that has only relative times has no start."""
     starts: dict[str, int] = {}
     for row in rows:
@@ -635,7 +627,7 @@ def _iso(ns: int) -> str:
 # --- held-out errors --------------------------------------------------------------------------------------------------
 
 
-def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
+def _held_out_rows(rows: Sequence[page.RssRow]) -> list[page.RssRow]:
     """Return rows with the RMSE after the offset of the other flights of the same setting, tower and channel."""
     groups: dict[tuple[str, str, str, str], list[int]] = {}
     for i, row in enumerate(rows):
@@ -658,7 +650,9 @@ def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-def rank_settings(rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str]) -> list[SettingRank]:
+def rank_settings(
+    rows: Iterable[page.RssRow], settings: Sequence[str], flights: Sequence[str]
+) -> list[page.SettingRank]:
     """Rank settings by their mean error over flights, with their difference to the first on the same flights.
 
     Parameters
@@ -684,7 +678,7 @@ def rank_settings(rows: Iterable[RssRow], settings: Sequence[str], flights: Sequ
     for name in known:
         difference = verdict.mean_of_flights(_paired(table[name], table[known[0]], flights))
         choices.append(
-            SettingRank(
+            page.SettingRank(
                 setting=name,
                 n_flights=len(means[name]),
                 mean_db=float(means[name].mean()),
@@ -711,7 +705,7 @@ def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequenc
 # --- steps of offsets -------------------------------------------------------------------------------------------------
 
 
-def _flown(rows: Sequence[RssRow], order: Sequence[str], started: Mapping[str, int]) -> tuple[NodeOffset, ...]:
+def _flown(rows: Sequence[page.RssRow], order: Sequence[str], started: Mapping[str, int]) -> tuple[NodeOffset, ...]:
     """Return the offsets of each tower and channel over the flights, minus their common part, and their steps."""
     known = {(row.flight, row.link): row.moments.mean_db for row in rows}
     links = list(dict.fromkeys(row.link for row in rows))
@@ -766,7 +760,7 @@ def _radio(link: Mapping[str, Any], end: str) -> str:
 # --- places -----------------------------------------------------------------------------------------------------------
 
 
-def _places_db(rows: Sequence[RssRow], cell_m: float) -> dict[tuple[int, int], float]:
+def _places_db(rows: Sequence[page.RssRow], cell_m: float) -> dict[tuple[int, int], float]:
     """Return the mean residual of each cell of the plan over flights, towers and channels [dB]."""
     residuals: dict[tuple[int, int], list[float]] = {}
     for row in rows:

@@ -32,20 +32,7 @@ from ..flight.training import counted_once, flight_logs, knows, learned_patterns
 from ..maps.grid import Grid, Layer, LinkBudget
 from ..propagation.geometry import Poses, rotation_from_aircraft
 from ..report import maps as page
-from ..report.prediction import (
-    FLAGS,
-    TITLES,
-    PredictionPage,
-    cautions,
-    first_words,
-    heading_words,
-    memory_cautions,
-    outside_share,
-    prediction_metrics,
-    prior_cautions,
-    prior_words,
-    write_prediction,
-)
+from ..report import prediction as pages
 from ..site.antennas import MeasuredPattern
 from ..site.learned import BAND as CARRIER_BAND
 from ..site.learned import folder_of, read_learned
@@ -92,7 +79,7 @@ MOST_RANKED = 50_000
 # Distance that is equivalent to a turn of 60 degrees when the nearest ranked target is chosen [m].
 _NOSE_M = 50.0
 
-_FLAG_CODES = {name: code for code, name in enumerate(["", *FLAGS])}
+_FLAG_CODES = {name: code for code, name in enumerate(["", *pages.FLAGS])}
 
 # Receiver of each tower, the link with its arrays, and the folder of their files.
 Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
@@ -102,7 +89,7 @@ Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
 class Prediction:
     """A prediction: the record of its page, and further data for maps."""
 
-    page: PredictionPage
+    page: pages.PredictionPage
     targets: Targets
     model: Flown | Memory | Prior
     sources: Mapping[str, Source]
@@ -174,7 +161,7 @@ def predict(
         table = _table(targets, site, (sources, model, receivers), stages.progress)
     about = _model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table)
     cautioned = [f"{text}." for text in site.cautions(source.tower for source in sources.values())]
-    page = PredictionPage(
+    page = pages.PredictionPage(
         name=targets.name,
         kind=targets.kind,
         heights_m=targets.heights_m,
@@ -193,11 +180,11 @@ def _model_fields(
     model: Flown | Memory | Prior, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
 ) -> dict[str, Any]:
     """Return the fields of the page about the model and its training data."""
-    guess = outside_share(table)
+    guess = pages.outside_share(table)
     expected = (
         float(np.sqrt((table["slow_sd_db"] ** 2).mean())),
         float((table["q95_db"] - table["q05_db"]).mean()) / 2.0,
-        heading_words(table["yaw_deg"].to_numpy(np.float64)),
+        pages.heading_words(table["yaw_deg"].to_numpy(np.float64)),
         float(table[P_LOCK].mean()) if P_LOCK in table else None,
     )
     logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
@@ -207,17 +194,17 @@ def _model_fields(
     }  # fmt: skip
     if not isinstance(model, Flown):
         base = "prior" if isinstance(model, Prior) else "memory"
-        fields["chosen"] = {"title": TITLES[base], "base": base, "corrected": False, "field": OFF}
+        fields["chosen"] = {"title": pages.TITLES[base], "base": base, "corrected": False, "field": OFF}
     if isinstance(model, Prior):
-        origin = prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
-        verdict = first_words(None, 0.0, *expected, origin=origin)
+        origin = pages.prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
+        verdict = pages.first_words(None, 0.0, *expected, origin=origin)
         off = outside_area(table[["east_m", "north_m"]].to_numpy(np.float64), model.site).mean()
-        return fields | {"verdict": verdict, "warnings": prior_cautions(PRIOR_SD_DB, float(off))}
+        return fields | {"verdict": verdict, "warnings": pages.prior_cautions(PRIOR_SD_DB, float(off))}
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return fields | {
-            "verdict": first_words(None, guess, *expected),
-            "warnings": memory_cautions([(m.entry, m.series) for m in model.known.values()], guess),
+            "verdict": pages.first_words(None, guess, *expected),
+            "warnings": pages.memory_cautions([(m.entry, m.series) for m in model.known.values()], guess),
             "flights": [name for entry in entries for name in entry.flights],
             KEY: union(*(entry.trained_on for entry in entries), *logs),
             MARKS: union(*(end.marks for m in model.known.values() for end in (m.tower, m.uav)), *marks),
@@ -225,17 +212,17 @@ def _model_fields(
     correction = model.correction
     key = correction.base, correction.title
     return fields | {
-        "verdict": first_words(correction, guess, *expected),
-        "warnings": cautions(correction, guess),
+        "verdict": pages.first_words(correction, guess, *expected),
+        "warnings": pages.cautions(correction, guess),
         KEY: union(*map(flight_logs, known), *logs, *model.trained_on),
         MARKS: union(marks_of(known), *marks, *model.marks),
         "candidates": [
-            {"base": TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
+            {"base": pages.TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
             for (base, name), crps in sorted(correction.crps_db.items(), key=lambda item: item[1])
         ],
         "model": asdict(correction.model),
         "chosen": {
-            "title": f"{TITLES[correction.base]}, {correction.title}",
+            "title": f"{pages.TITLES[correction.base]}, {correction.title}",
             "base": correction.base,
             "corrected": correction.on,
             "field": correction.title,
@@ -635,10 +622,12 @@ def run_predict(
         prediction = predict(where, known, target, logs_root=options.logs_root, stages=stages)
         with output.filling() as place:
             options.progress("page")
-            written, remarks = write_prediction(prediction.page, place)
+            written, remarks = pages.write_prediction(prediction.page, place)
         for text in remarks:
             options.progress(text)
-        return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=output.placed(written))
+        return JobOutcome(
+            folder=folder, metrics=pages.prediction_metrics(prediction.page), files=output.placed(written)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -661,7 +650,7 @@ class CorrectedMaps:
 
     levels: tuple[CorrectedLevel, ...]
     ranks: dict[tuple[str, float], FloatArray]
-    prediction: PredictionPage
+    prediction: pages.PredictionPage
 
     def layers(self, grid: Grid) -> Iterator[Layer]:
         """Yield the layers of page and files: corrected and raw level, and standard deviation."""

@@ -18,18 +18,9 @@ from ..common.jsonable import fields_of, json_safe
 from ..common.stages import Stages
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray
+from ..compare import result as results
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.referee import AVERAGED, OURS
-from ..compare.result import (
-    APPLIED,
-    CANNOT_TELL,
-    GIVEN,
-    AuditResult,
-    ClockResult,
-    EngineResult,
-    RankResult,
-    RssResult,
-)
 from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
 from . import flight_words as words
@@ -86,7 +77,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
     return safe
 
 
-def _rss_metrics(series: RssResult) -> dict[str, Any]:
+def _rss_metrics(series: results.RssResult) -> dict[str, Any]:
     score = series.score
     return {
         "offset_db": score.offset_db, "rmse_db": score.rmse_db, "n": score.n,
@@ -107,13 +98,13 @@ def _rss_metrics(series: RssResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def clock_metrics(clock: ClockResult) -> dict[str, Any]:
+def clock_metrics(clock: results.ClockResult) -> dict[str, Any]:
     """Return the entry ``clock.<receiver>`` of metrics.json: numbers, verdict, whether it was applied, and checks."""
     return {
         **clock.checks,
         "radio_minus_telemetry_s": clock.radio_minus_telemetry_s, "ci95_s": clock.ci95_s, "verdict": clock.verdict,
         "reason": clock.reason,
-        "applied": clock.applied in (APPLIED, GIVEN),
+        "applied": clock.applied in (results.APPLIED, results.GIVEN),
     }  # fmt: skip
 
 
@@ -125,7 +116,7 @@ def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, An
     }
 
 
-def _rank_metrics(series: RankResult) -> dict[str, Any]:
+def _rank_metrics(series: results.RankResult) -> dict[str, Any]:
     score = series.score
     simulated = {
         k: {
@@ -153,7 +144,7 @@ def _rank_metrics(series: RankResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
+def _engine_metrics(engine: results.EngineResult) -> dict[str, Any]:
     audit = engine.audit
     return {
         "engine": engine.engine, "links": engine.links, "seconds": engine.seconds, "paths": engine.paths,
@@ -240,14 +231,14 @@ def channels_card(data: ReportData) -> Card:
     return Card(title="Received signal strength", id="rss", link="RSS", fold=True, parts=parts if data.rss else ())
 
 
-def _channel(data: ReportData, p: RssResult) -> Card:
+def _channel(data: ReportData, p: results.RssResult) -> Card:
     score, independent = p.score, p.score.intervals.n_effective
     fitted = [f"Fitted on the scored samples: {', '.join(_FITTED.get(name, name) for name in score.fitted_on_scored)}."]
     if math.isfinite(independent):
         count = counted(round(independent), "independent sample")
         fitted.append(f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}.")
         fitted.append(f"The {number(score.n, 0)} samples count as about {count}.")
-    lag = f", radio minus telemetry {number(score.lag_s, 2, 's')}" if p.clock_verdict != CANNOT_TELL else ""
+    lag = f", radio minus telemetry {number(score.lag_s, 2, 's')}" if p.clock_verdict != results.CANNOT_TELL else ""
     return Card(
         title=p.name, group="rss-channel", chart=f"rss/{p.tower}/{p.channel}",
         text=[paragraph(
@@ -433,7 +424,7 @@ def engine_card(data: ReportData) -> Card:
     )  # fmt: skip
 
 
-def _audited_paths(a: AuditResult) -> Table:
+def _audited_paths(a: results.AuditResult) -> Table:
     return Table(
         caption="Paths and levels of the two engines on the same links, which are spread over all channels.",
         columns={"Reference": HEAD, "Links": 0, "Paths missing": 0,

@@ -28,25 +28,7 @@ from ..common.geodesy import SiteFrame
 from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
-from .mapfiles import (
-    MAX_CROSSINGS,
-    Kind,
-    MapFile,
-    Outline,
-    Position,
-    TreeLine,
-    below_ground,
-    height_of,
-    is_part,
-    is_tangled,
-    kind_of,
-    levels_of,
-    main_tag,
-    material_of,
-    metres,
-    positive_metres,
-    read_map_file,
-)
+from . import mapfiles
 from .site import Building, Forest, Geofence
 from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SingleTreeModel, SiteModel, build_site, extent_m, site_model
 
@@ -112,7 +94,7 @@ class Footprints:
     forests: list[Forest] = field(default_factory=list)
     geofences: list[Geofence] = field(default_factory=list)
     trees: list[SingleTreeModel] = field(default_factory=list)
-    ground: list[tuple[Position, float]] = field(default_factory=list)
+    ground: list[tuple[mapfiles.Position, float]] = field(default_factory=list)
     credits: list[str] = field(default_factory=list)
     assumed: str = ""
     actions: list[str] = field(default_factory=list)
@@ -143,7 +125,7 @@ def import_footprints(
     files: Sequence[str | Path],
     frame: SiteFrame,
     *,
-    untagged: Kind | None = None,
+    untagged: mapfiles.Kind | None = None,
     trees: bool = False,
     area_m: tuple[float, float, float, float] | None = None,
 ) -> Footprints:
@@ -174,12 +156,12 @@ def import_footprints(
     UsageError
         If ``untagged`` is not a kind of area.
     """
-    if untagged is not None and untagged not in get_args(Kind):
-        raise UsageError(f"untagged areas as '{untagged}'", expected="one of " + ", ".join(get_args(Kind)))
+    if untagged is not None and untagged not in get_args(mapfiles.Kind):
+        raise UsageError(f"untagged areas as '{untagged}'", expected="one of " + ", ".join(get_args(mapfiles.Kind)))
     result = Footprints()
-    shapes: dict[Kind, list[_Shape]] = {"building": [], "forest": [], "geofence": []}
+    shapes: dict[mapfiles.Kind, list[_Shape]] = {"building": [], "forest": [], "geofence": []}
     for path in files:
-        content = read_map_file(path)
+        content = mapfiles.read_map_file(path)
         result.actions += content.notes
         if content.credit and content.credit not in result.credits:
             result.credits.append(content.credit)
@@ -207,23 +189,28 @@ def import_footprints(
 
 
 def _sort(
-    content: MapFile,
+    content: mapfiles.MapFile,
     name: str,
     frame: SiteFrame,
-    untagged: Kind | None,
-    shapes: dict[Kind, list[_Shape]],
+    untagged: mapfiles.Kind | None,
+    shapes: dict[mapfiles.Kind, list[_Shape]],
     actions: list[str],
 ) -> None:
     """Add each outline of the file ``name`` to the shapes of its kind, and count outlines of unknown kind."""
     skipped: Counter[str] = Counter()
     for outline in content.outlines:
-        bare = untagged if main_tag(outline.tags) == "untagged" else None
-        kind = kind_of(outline.tags) or bare or ("geofence" if content.kind == "KML" else None)
-        if kind is None or (kind == "building" and below_ground(outline.tags)):
-            skipped[main_tag(outline.tags) if kind is None else "building below the ground"] += 1
+        bare = untagged if mapfiles.main_tag(outline.tags) == "untagged" else None
+        kind = mapfiles.kind_of(outline.tags) or bare or ("geofence" if content.kind == "KML" else None)
+        if kind is None or (kind == "building" and mapfiles.below_ground(outline.tags)):
+            skipped[mapfiles.main_tag(outline.tags) if kind is None else "building below the ground"] += 1
             continue
         actions += [f"{outline.source}: {problem}" for problem in dict.fromkeys(outline.broken)]
-        if kind == "geofence" and "height" in outline.tags and kind_of(outline.tags) is None and untagged is None:
+        if (
+            kind == "geofence"
+            and "height" in outline.tags
+            and mapfiles.kind_of(outline.tags) is None
+            and untagged is None
+        ):
             text = f"an area {outline.tags['height']} m high without a tag: used as a geofence"
             actions.append(f"{outline.source}: {text}; '--untagged building' makes it a building")
         shape = _project(outline, frame, actions)
@@ -240,14 +227,14 @@ def _sort(
         actions.append(f"{name}: left out, no building or forest above the ground: {listed}{more}{hint}")
 
 
-def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTreeModel]:
+def _single_trees(tree: mapfiles.TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTreeModel]:
     """Return a tree with its tagged sizes, or the trees of a row."""
     notes: list[str] = []
     height = _size(tree.tags, ("height", "est_height"), TALLEST_TREE_M, "a tree {:g} m high", notes)
     crown = _size(tree.tags, ("diameter_crown", "crown_diameter"), WIDEST_CROWN_M, "a crown {:g} m wide", notes)
     tags, written = dict(tree.tags), tree.tags.get("circumference", "").strip()
     # read a number without unit as centimetres if no tree reaches it in metres or feet
-    if 3.3 * _WIDEST_GIRTH_M < (metres(f"{written} m") or 0.0) <= 100.0 * _WIDEST_GIRTH_M:
+    if 3.3 * _WIDEST_GIRTH_M < (mapfiles.metres(f"{written} m") or 0.0) <= 100.0 * _WIDEST_GIRTH_M:
         notes.append(f"the circumference '{written}' is taken as centimetres")
         tags["circumference"] = f"{written} cm"
     girth = _size(tags, ("circumference",), _WIDEST_GIRTH_M, "a trunk {:g} m around", notes)
@@ -270,7 +257,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
 
 def _size(tags: Mapping[str, str], keys: tuple[str, ...], most_m: float, what: str, notes: list[str]) -> float | None:
     """Return a size of a tree or a wood [m]. If too small or too large, it is noted and not used."""
-    size = positive_metres(tags, keys, notes)
+    size = mapfiles.positive_metres(tags, keys, notes)
     if size is None or _SMALLEST_SIZE_M <= size <= most_m:
         return size
     notes.append(f"{what.format(size)}; feet or centimetres? The site's default is used")
@@ -301,7 +288,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
     return near_shapes
 
 
-def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float | None) -> None:
+def _fill(result: Footprints, shapes: dict[mapfiles.Kind, list[_Shape]], canopy_m: float | None) -> None:
     actions = result.actions
     buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
     # where woods overlap, keep the first one in the file, because woods have no heights to compare
@@ -334,7 +321,7 @@ def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float 
 # ---------------------------------------------------------------- what an outline is, and where
 
 
-def _check_place(content: MapFile, frame: SiteFrame) -> None:
+def _check_place(content: mapfiles.MapFile, frame: SiteFrame) -> None:
     """Refuse a file whose outlines are all far away, and report if swapped coordinates would be near."""
     positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer]
     positions += [p for tree in content.trees for p in tree.positions]
@@ -374,7 +361,7 @@ def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
     return np.where(good, 111_200 * np.hypot(north, east), np.inf)
 
 
-def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape | None:
+def _project(outline: mapfiles.Outline, frame: SiteFrame, actions: list[str]) -> _Shape | None:
     """Return the valid outline in metres, or None and a line in ``actions`` if nothing remains."""
     areas, notes = [], []
     for outer, holes in outline.parts:
@@ -409,10 +396,10 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
         hint = "; latitude and longitude are swapped" if swapped else ""
         actions.append(f"warning: {outline.source}: left out, it lies {away / 1000:.0f} km from the site{hint}")
         return None
-    return _Shape(outline.name, outline.source, union, part=is_part(outline.tags))
+    return _Shape(outline.name, outline.source, union, part=mapfiles.is_part(outline.tags))
 
 
-def _why_no_ring(positions: Sequence[Position]) -> str:
+def _why_no_ring(positions: Sequence[mapfiles.Position]) -> str:
     for latitude, longitude in positions:
         if abs(latitude) > 90 or abs(longitude) > 540:
             return (
@@ -422,7 +409,7 @@ def _why_no_ring(positions: Sequence[Position]) -> str:
     return "an outer ring with fewer than 3 distinct points was left out"
 
 
-def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
+def _ring(positions: Sequence[mapfiles.Position], frame: SiteFrame) -> Polygon | None:
     # a ring repeats its first point, and some repeat all points
     if len(set(positions)) < 3:
         return None
@@ -435,8 +422,8 @@ def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
 def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
     if ring.is_valid:
         return ring
-    if is_tangled(ring):
-        notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places is skipped")
+    if mapfiles.is_tangled(ring):
+        notes.append(f"a ring that crosses itself at more than {mapfiles.MAX_CROSSINGS} places is skipped")
         return Polygon()
     notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
     # "structure" retains areas that a ring encloses twice; "linework" would make holes of them
@@ -450,18 +437,18 @@ def _areas_only(shape: BaseGeometry) -> BaseGeometry:
 # ---------------------------------------------------------------- heights and materials
 
 
-def _describe(shape: _Shape, outline: Outline, actions: list[str]) -> None:
+def _describe(shape: _Shape, outline: mapfiles.Outline, actions: list[str]) -> None:
     # shapefiles write the names of their columns in capitals
     tags = {key.lower(): value for key, value in outline.tags.items()}
     notes: list[str] = []
-    height = height_of(tags, notes)
-    levels = levels_of(tags, notes)
+    height = mapfiles.height_of(tags, notes)
+    levels = mapfiles.levels_of(tags, notes)
     shape.stated, shape.assumed = height is not None, height is None and not levels
     if height is None:
         height = levels * _LEVEL_M if levels else _DEFAULT_HEIGHT_M
         notes = [f"{note}; it is drawn {height:g} m high" for note in notes]
     lowest = tags.get("min_height", tags.get("building:min_level", tags.get("min_level", "0")))
-    if (metres(lowest) or 0.0) > 0:
+    if (mapfiles.metres(lowest) or 0.0) > 0:
         notes.append("it begins above the ground (min_height, min_level), but is drawn from the ground up")
     actions += [f"{shape.source}: {note}" for note in notes]
     if not _LOWEST_M <= height <= TALLEST_M:
@@ -471,7 +458,7 @@ def _describe(shape: _Shape, outline: Outline, actions: list[str]) -> None:
             cause="feet or centimetres in place of metres",
         )
     shape.height_m = height
-    shape.material = material_of(tags)
+    shape.material = mapfiles.material_of(tags)
     # a metre has 3.28 feet, so such a ratio of height to storeys is suspicious
     if height > 2 * _LEVEL_M and levels and 2.7 <= height / (levels * _LEVEL_M) <= 4.5:
         shape.stated = False  # counted by _warn_of_feet

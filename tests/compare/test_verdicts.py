@@ -216,8 +216,12 @@ def test_stated_errors_by_their_limits(
 ) -> None:
     """Errors of a known mean and spread, intervals that are given: 1.3 times its reach for a bias, 15 % for a spread."""
     error = mean + within * np.tile([1.0, -1.0], 20)
-    monkeypatch.setattr(verdicts, "mean_interval", lambda values, _: (values.mean() - reach, values.mean() + reach))
-    monkeypatch.setattr(verdicts, "spread_interval", lambda values, _: (0.99 * values.std(), 1.01 * values.std()))
+    monkeypatch.setattr(
+        verdicts.statistics, "mean_interval", lambda values, _: (values.mean() - reach, values.mean() + reach)
+    )
+    monkeypatch.setattr(
+        verdicts.statistics, "spread_interval", lambda values, _: (0.99 * values.std(), 1.01 * values.std())
+    )
     said = stated_errors(np.append(error, [np.nan, 9.0]), np.append(np.ones(40), [1.0, 0.0]))
     assert said.cause == cause
     if cause == "biased":

@@ -278,7 +278,7 @@ class _Builder:
     def _count(self, nodes: int, event: Any) -> None:
         self.nodes += nodes
         if self.nodes > _MAX_NODES:
-            self._fail(event, f"the file unfolds to more than {_MAX_NODES} values (aliases of aliases?)")
+            self._fail(event, f"the file expands to more than {_MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
         """Return the scalar, list or mapping that begins with an event. Its anchor can be used after its end."""

@@ -742,7 +742,7 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     side = _SIDES[round(azimuth / 45.0) % 8]
     yield Trial(
         name="place", cost=cost, change_db=changes[best], estimate=(radius, math.nan, math.nan),
-        sentence=f"the tower is about {radius:.0f} m {side} of its stated position, or the track is off the other way",
+        sentence=f"the tower is about {radius:.0f} m {side} of its stated place, or the track has the opposite error",
         next_step="check the coordinates of both",
     )  # fmt: skip
 
@@ -807,7 +807,7 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
     if e.serving is not None and np.ptp(e.serving) > 0.5:
         yield Trial(
             name="cell", sentence="the level steps where the phone changes its cell",
-            next_step="compare the cells apart", columns=_STEP_DB * e.serving[:, None],
+            next_step="compare the cells separately", columns=_STEP_DB * e.serving[:, None],
         )  # fmt: skip
 
 

@@ -66,7 +66,7 @@ class ModelRow:
         True for the simplest model within one standard error of the best, over all series of the flight. If the errors
         on other flights are known from a calibration, the model with the lowest error there is recommended instead.
     fastest_sufficient : bool
-        True for the first model, in the order of rising cost, whose difference to the best is not significant.
+        True for the first model, in the order of rising cost, whose difference from the best is not significant.
     distinct : bool
         False if the error is within 0.01 dB of that of an earlier model on every channel. The recommended model and
         that of the flight file are always distinct.

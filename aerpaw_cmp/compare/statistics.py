@@ -825,7 +825,8 @@ class PairedDifference:
             return f"no significant difference from {other_model} ({size})"
         near, far = sorted((abs(low), abs(high)))
         digits = 1 if near >= 0.05 else 2
-        return f"{self.verdict} than {other_model} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
+        size = f"{abs(difference):.{digits}f} dB [{near:.{digits}f}, {far:.{digits}f}]"
+        return f"{self.verdict} than {other_model} by {size}"
 
 
 # Smaller differences [dB] between the errors of two models are rounding.

@@ -446,6 +446,6 @@ def p833_note(carrier_hz: float) -> str | None:
     model = foliage.P833.at(carrier_hz)
     return (
         f"Trees at {carrier_hz / 1e9:g} GHz: an extrapolation of ITU-R P.833, whose table of woodland covers {low:g} "
-        f"to {high:g} MHz. Beyond it, gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "
-        "dB in leaf; other extrapolations yield 0.45 to 0.7 dB/m at 3.4 GHz, so treat gamma as a sensitivity."
+        f"to {high:g} MHz. With leaves, gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} dB. "
+        "Other extrapolations have 0.45 to 0.7 dB/m at 3.4 GHz, so try several values of gamma."
     )

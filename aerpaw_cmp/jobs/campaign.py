@@ -300,7 +300,7 @@ def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: i
         numbers = [number for number, task in enumerate(tasks) if task.setting == setting]
         left, known = len({*numbers} - {*kept}), spent.get(setting, every)
         seconds = left * sum(known) / len(known) / workers if known else None
-        work = f"{counted(len(numbers), 'task')}, {len(numbers) - left} kept"
+        work = f"{counted(len(numbers), 'task')}, {len(numbers) - left} stored"
         stages.append(PlannedStage(f"flights, {setting}", work, seconds if left else 0.0))
     return stages
 
@@ -653,7 +653,7 @@ def _held_out_rows(rows: Sequence[page.RssRow]) -> list[page.RssRow]:
 def rank_settings(
     rows: Iterable[page.RssRow], settings: Sequence[str], flights: Sequence[str]
 ) -> list[page.SettingRank]:
-    """Rank settings by their mean error over flights, with their difference to the first on the same flights.
+    """Rank settings by their mean error over flights, with their difference from the first on the same flights.
 
     Parameters
     ----------

@@ -156,9 +156,9 @@ def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -
             f"Path-loss exponent {estimate.slope:.1f} ± {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",
             ends,
             f"Height of the node: {low:g} m"
-            + ("." if low == high else f" or {high:g} m. The levels do not decide between them."),
-            f"Floor of the receiver: {floor}. The levels determine weights for strength and "
-            "length of the shadowing. No path is ray-traced.",
+            + ("." if low == high else f" or {high:g} m. The levels do not distinguish them."),
+            f"Floor of the receiver: {floor}. Several strengths and correlation lengths of shadowing are weighted by "
+            "how well they explain the levels. No path is ray-traced.",
         ),
         "warnings": (edge,) if estimate.at_edge else (),
     }
@@ -167,7 +167,7 @@ def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -
 def _sentence(position: dict[str, float], modes: Sequence[dict[str, Any]], radius_m: float) -> str:
     if len(modes) == 1:
         at = f"{position['latitude_deg']:.6f}, {position['longitude_deg']:.6f}"
-        return f"The node is most likely at {at}, 90 % within {radius_m:.0f} m."
+        return f"The node is most likely at {at} (latitude, longitude), with 90 % probability within {radius_m:.0f} m."
     places = [
         f"{m['latitude_deg']:.6f}, {m['longitude_deg']:.6f} (within {m['radius_m']:.0f} m, {100.0 * m['share']:.0f} %)"
         for m in modes

@@ -235,8 +235,8 @@ def scores_card(data: CalibrationData) -> Card:
     rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
     keys = ("rmse_db", "rmse_4s_db", *BASELINES)
     means = Table(
-        caption="RMSE in dB after one offset per flight and channel, mean over flights and channels; a dash: it could "
-        "not be held out.",
+        caption="RMSE in dB after one offset per flight and channel, mean over flights and channels. A dash means that "
+        "it could not be held out. Controls are the same fit in a wrong frame, and without measured patterns.",
         columns={"Held out": HEAD, **each, **baselines, "channels": 0},
         rows=[(SPLIT_TITLE.get(name, name), *(_mean(of, key) for key in keys), len(of)) for name, of in rows.items()],
     )  # fmt: skip
@@ -276,8 +276,7 @@ def gains_card(data: CalibrationData) -> Card:
     seen = ", ".join(f"{percent(_share_seen(a))} of the sphere of {a.name}" for a in data.antennas)
     text = (
         f"Flights measured directions within 10 degrees of {seen}. Elsewhere the gain is extrapolated, with a large "
-        "standard deviation. The level is normalised to a mean of 0 dBi over the sphere, because offsets can replace "
-        "it."
+        "standard deviation. The mean over the sphere is set to 0 dBi, because the offsets contain it."
     )
     shown = Positions(view="places", data=payload(list(_groups(data))))
     return Card(title="Gain of the antennas", positions=shown, text=[text])

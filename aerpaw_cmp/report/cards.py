@@ -72,7 +72,7 @@ def estimate(value: float | None, ends: Interval | None, form: str | int = 2, ma
     """
     if form == SHARE and ends is not None:
         ends = 100 * ends[0], 100 * ends[1]
-    shown = interval(ends, form if isinstance(form, int) else 0)
+    shown = interval(None if cell(value, form) == "\u2013" else ends, form if isinstance(form, int) else 0)
     return Markup('{} <span class="small">{}</span>').format(Markup(mark).format(cell(value, form)), shown)
 
 

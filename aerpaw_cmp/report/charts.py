@@ -79,8 +79,8 @@ def charts_of(data: ReportData) -> list[Chart]:
         shown = [row for row in data.models if row.distinct]
         charts.append(Chart(
             section="ladder", title="Models from the simplest to the most complex",
-            caption="RMSE on held-out areas, over all channels. Whiskers: 95 % interval of the difference to the best "
-            "model on the same samples.",
+            caption="RMSE on held-out areas, over all channels. Whiskers: 95 % interval of the difference from the "
+            "best model on the same samples.",
             content=_errors(shown),
         ))  # fmt: skip
     charts += [

@@ -236,8 +236,8 @@ def _channel(data: ReportData, p: results.RssResult) -> Card:
     fitted = [f"Fitted on the scored samples: {', '.join(_FITTED.get(name, name) for name in score.fitted_on_scored)}."]
     if math.isfinite(independent):
         count = counted(round(independent), "independent sample")
-        fitted.append(f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}.")
-        fitted.append(f"The {number(score.n, 0)} samples count as about {count}.")
+        fitted.append(f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}:")
+        fitted.append(f"for this interval, the {number(score.n, 0)} samples count as about {count}.")
     lag = f", radio minus telemetry {number(score.lag_s, 2, 's')}" if p.clock_verdict != results.CANNOT_TELL else ""
     return Card(
         title=p.name, group="rss-channel", chart=f"rss/{p.tower}/{p.channel}",
@@ -350,9 +350,9 @@ def models_card(data: ReportData) -> Card:
     notes = {row.model: ", ".join(["recommended"] * row.recommended + ["fastest sufficient"] * row.fastest_sufficient)
              for row in shown}  # fmt: skip
     pooled = Table(
-        caption="RMSE on held-out areas over all channels, and its difference to the best model on the same samples, "
-        "with its 95 % interval.",
-        columns={"No.": RIGHT, "Model": HEAD, "RMSE [dB]": 1, "Difference to the best [dB]": RIGHT, "Time [s]": 2,
+        caption="RMSE on held-out areas over all channels, and its difference from the best model on the same "
+        "samples, with its 95 % interval.",
+        columns={"No.": RIGHT, "Model": HEAD, "RMSE [dB]": 1, "Difference from the best [dB]": RIGHT, "Time [s]": 2,
                  "Note": TEXT},
         rows=[
             (str(number), bold(row.model) if row.recommended else row.model, row.rmse_heldout_db,
@@ -360,12 +360,12 @@ def models_card(data: ReportData) -> Card:
             for number, row in enumerate(shown, 1)
         ],
         notes=["The recommended model is the simplest replay within one standard error of the best replay. Models are "
-               "listed by rising cost. The fastest sufficient model is the first whose difference to the best model is "
-               "not significant.",
+               "listed by rising cost. The fastest sufficient model is the first whose difference from the best model "
+               "is not significant.",
                *([f"Within 0.01 dB of a row above on every channel: {'; '.join(same)}."] if same else [])],
     )  # fmt: skip
     each = Table(
-        caption="RMSE in dB on held-out areas. \u0394: 95 % interval of its difference to the best model.",
+        caption="RMSE in dB on held-out areas. \u0394: 95 % interval of its difference from the best model.",
         columns={"Tower": HEAD, "Channel": HEAD, **{f"Model {number}": RIGHT for number in range(1, len(shown) + 1)}},
         rows=[
             (*of, *(Markup('{} <span class="small">\u0394 {}</span>').format(

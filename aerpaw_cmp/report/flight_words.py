@@ -102,7 +102,7 @@ def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
     ``verdicts`` has the verdict of the paired interval of each other setting. At most ``most`` settings are named.
     """
     if set(verdicts.values()) == {NO_INTERVAL}:
-        return "Too few flights for an interval of the difference to another setting."
+        return "Too few flights for an interval of the difference from another setting."
     alike = [name for name, word in verdicts.items() if word != "worse"]
     if not alike:
         return "Every other setting is significantly worse (95 %)."
@@ -259,7 +259,7 @@ def audit_paths(audit: AuditResult) -> str:
             + (" (each passed a second test)" if tested else "")
         )
     if math.isfinite(audit.rss_max_error_db):
-        parts.append(f"RSS differs by at most {max(audit.rss_max_error_db, 0.001):.2g} dB")
+        parts.append(f"RSS differs by at most {max(math.ceil(1e3 * audit.rss_max_error_db), 1) / 1e3:.3f} dB")
     return ", ".join(parts)
 
 
@@ -287,7 +287,7 @@ def models_verdict(models: Sequence[ModelRow]) -> str:
     if fastest.model not in (least, *lines):
         text += (
             f" \u201c{fastest.model}\u201d ({fastest.seconds:.2g} s) is the fastest sufficient model: its difference "
-            "to the best model is not significant."
+            "from the best model is not significant."
         )
     if best.model == AS_SET:
         return f"{text} No model of the replay is significantly better, by 0.1 dB or more, than this flight file."
@@ -668,7 +668,7 @@ def _rank(panel: RankResult) -> Headline | None:
     """Return the card of the rank forecast, or else of the predicted shares. None if nothing could be scored."""
     if score := _forecast_of(panel):
         return Headline(
-            label=f"Rank forecast at {panel.tower}", value=f"kappa {score.kappa:.2f}",
+            label=f"Rank forecast at {panel.tower}, agreement beyond chance", value=f"kappa {score.kappa:.2f}",
             interval=_interval(score.kappa_ci95, ".2f"), reference=_log_score(score),
         )  # fmt: skip
     k = nearest_k(panel)
@@ -681,5 +681,5 @@ def _rank(panel: RankResult) -> Headline | None:
     guess = f"; always guessing {commonest.rank}: {100 * commonest.agreement:.0f} %" if commonest.rank else ""
     return Headline(
         label=f"Rank at {panel.tower}, K = {k:.10g}", value=f"{at.total_variation:.2f}",
-        interval=f"total variation of the shares{ends}", reference=f"{agree}{guess}",
+        interval=f"total variation of the shares, from 0 to 1{ends}", reference=f"{agree}{guess}",
     )  # fmt: skip

@@ -178,7 +178,7 @@ def first_words(data: MapsData) -> str:
         return ""
     worst = min(heights, key=lambda height: height.covered)
     thinned = any(item.foliage == "attenuating" for item in data.rss)
-    thinner = "compare the rows of attenuating trees" if thinned else "map with `--foliage attenuating`, too"
+    thinner = "compare the rows with attenuating trees" if thinned else "map with `--foliage attenuating`, too"
     shares = {"percent": 100.0 * worst.covered, "outside": 100.0 * worst.outside}
     sentence = said_of(coverage_verdict(heights), CAUSES, thinner=thinner, **shares)
     best = max(heights, key=lambda height: height.covered)
@@ -737,7 +737,8 @@ def coverage_table(data: MapsData) -> Table:
         whose = f"the other {counted(full, 'row')}" if rows else "every antenna, foliage and tower"
         rows.append((whose, "", "", *[percent(1.0, 1)] * len(heights)))
     columns = {"Antennas": TEXT, "Foliage": TEXT, "Tower": HEAD, **{f"{height:g} m": RIGHT for height in heights}}
-    return Table(caption="Share of positions in coverage.", columns=columns, rows=rows)
+    caption = "Share of positions in coverage. MIMO: array, SISO: one element; joint: the nearest tower serves."
+    return Table(caption=caption, columns=columns, rows=rows)
 
 
 def levels_card(data: MapsData) -> Card:

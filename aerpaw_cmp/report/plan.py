@@ -85,7 +85,7 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
     target = data.target if data.seen_from_m is None else "all directions around the towers, at all headings"
     known = f"Known flights: {', '.join(data.flights)}."
     if not data.flights:
-        known = "No flight is known: antennas are those that the model assumes."
+        known = "No flight was named, so the gains of both antennas are unknown."
     return Page(
         kind="plan", title=f"Next flight for {target}", verdict=data.sentence, cautions=data.warnings,
         about=[f"{known} Channels: {', '.join(data.antennas)}. Made {minute(data.generated)}. "

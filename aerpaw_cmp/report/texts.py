@@ -54,13 +54,13 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
 def interval(value: tuple[float | None, float | None] | None, decimals: int = 1) -> str:
     """Return an interval as the text ``[low, high]``, or a lower bound as ``≥ low``.
 
-    The text is empty for None and "cannot tell" if both ends are missing.
+    The text is empty for None and "no interval" if both ends are missing.
     """
     if value is None:
         return ""
     low, high = (math.nan if end is None else end for end in value)
     if not math.isfinite(low):
-        return "cannot tell"
+        return "no interval"
     return (
         f"[{number(low, decimals)}, {number(high, decimals)}]" if math.isfinite(high) else f"≥ {number(low, decimals)}"
     )

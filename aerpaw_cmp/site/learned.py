@@ -335,7 +335,7 @@ class Entry(StrictModel):
                 f"{lock.floor_db:g} count as {lock.floor_db:g}"
             )
         kappas = [receiver.kappa for receiver in self.receivers if receiver.kappa is not None]
-        return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")
+        return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} of ranks on another flight" if kappas else "")
 
 
 _Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]

@@ -51,7 +51,7 @@ class FilledPatch:
     cells : int
         Number of cells.
     jump_m : float
-        Median difference to the cells around the patch [m].
+        Median difference from the cells around the patch [m].
     """
 
     height_m: float

@@ -632,7 +632,7 @@ def _unmapped(towers: Mapping[str, Tower], shapes: list[Polygon]) -> list[str]:
     bare = [t.name for t in towers.values() if place.distance(Point(t.east_m, t.north_m)) > _MAPPED_M]
     if not shapes or not bare:
         return []
-    return [f"no map here: no building and no wood is known within {_MAPPED_M:g} m of {', '.join(bare)}"]
+    return [f"no map here: the site has no building and no wood within {_MAPPED_M:g} m of {', '.join(bare)}"]
 
 
 def _outside(value: float, low: float, high: float) -> float:
@@ -683,7 +683,7 @@ def _chosen_position(
         if source != key:
             place_of_source = frame.to_local(position.latitude_deg, position.longitude_deg)
             apart = math.hypot(float(place[0] - place_of_source[0]), float(place[1] - place_of_source[1]))
-            notes.append(f"{name}: source {source} lies {apart:.1f} m from source {key}, which is used")
+            notes.append(f"{name}: the positions in sources {key} (used) and {source} differ by {apart:.1f} m")
     return chosen
 
 

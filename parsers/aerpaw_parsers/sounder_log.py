@@ -266,7 +266,7 @@ def _stream(log: _Piece, repeats: _Samples, options: ReadOptions, warnings: list
         repeated = np.isin(samples.line, repeats.line)  # lines of '*' contain no other samples
         restored = counted(len(repeats.line), "sample was", "samples were")
         warnings.append(
-            f"{restored} restored: the log has '*' (of the program od) for values that repeat. Flagged 'repeated'"
+            f"{restored} restored, flagged 'repeated': the program od writes '*' instead of values that repeat"
         )
     # a log may have 1 GB: free each column as soon as it is not needed
     jump = samples.offset

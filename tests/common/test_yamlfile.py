@@ -87,7 +87,7 @@ def test_all_mistakes_at_once() -> None:
 def test_alias_bomb_and_deep_nesting_are_refused() -> None:
     rows = ["a0: &a0 [1,1,1,1,1,1,1,1,1,1]"]
     rows += [f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 9)]
-    assert "unfolds to more than" in failure("\n".join(rows)).found
+    assert "expands to more than" in failure("\n".join(rows)).found
     assert "nested deeper" in failure("anything: " + "[" * 100_000).found
 
 

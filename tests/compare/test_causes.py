@@ -442,7 +442,7 @@ def test_a_displaced_tower_is_no_error_of_height_and_has_its_side() -> None:
     )  # fmt: skip
     cause = flight_cause([e])
     assert cause is not None
-    assert (cause.name, "south of its stated position" in cause.sentence) == ("place", True)
+    assert (cause.name, "south of its stated place" in cause.sentence) == ("place", True)
     assert cause.estimate == pytest.approx(170.0, abs=30.0)
     assert _named(replace(e, measured_db=e.predicted_db + noise)) == NONE
 

@@ -329,15 +329,15 @@ def test_a_dry_run_says_what_is_kept(folder: Path, capsys: pytest.CaptureFixture
     store = OutcomeStore(folder / "outcomes", Outcome)
     for label, setting in settings.items():
         stage = stages[f"flights, {label}"]
-        assert stage["work"] == "2 tasks, 1 kept"
+        assert stage["work"] == "2 tasks, 1 stored"
         task = Task(folder / "first.yaml", "first", label, setting, None)
         assert stage["seconds"] == pytest.approx(store.load(digest_of(task)).seconds / 2)
     run(campaign, folder, keep=folder / "outcomes")
     assert main(["campaign", str(path), "--dry-run", "--json", *keep]) == 0
     again = json.loads(capsys.readouterr().out)["stages"]
-    assert [(stage["work"], stage["seconds"]) for stage in again[1:]] == [("2 tasks, 2 kept", 0.0)] * 2
+    assert [(stage["work"], stage["seconds"]) for stage in again[1:]] == [("2 tasks, 2 stored", 0.0)] * 2
     assert main(["campaign", str(path), "--dry-run", "--fresh", "-o", str(folder / "new")]) == 0
-    assert "2 tasks, 0 kept" in capsys.readouterr().out
+    assert "2 tasks, 0 stored" in capsys.readouterr().out
 
 
 def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:

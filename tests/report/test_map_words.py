@@ -22,7 +22,7 @@ from aerpaw_cmp.report.maps import MapsData, RssMap, first_words, warnings
             {},
             "trees cause most of the gaps. The map contains no measurement. Next: fly higher, or map with `--foliage",
         ),
-        ({"opaque": 0.6, "attenuating": 0.9, "none": 0.95}, {}, "Next: fly higher, or compare the rows of attenuating"),
+        ({"opaque": 0.6, "attenuating": 0.9, "none": 0.95}, {}, "Next: fly higher, or compare the rows with"),
         ({"opaque": 0.6, "none": 0.62}, {}, "buildings and terrain cause most of the gaps"),
         (
             {"none": 0.0},

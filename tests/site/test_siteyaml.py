@@ -43,8 +43,8 @@ def test_sources_differ_by_what_the_site_says() -> None:
         of_a, of_b = a.towers[name], b.towers[name]
         apart = Geod(ellps="WGS84").inv(of_a.longitude_deg, of_a.latitude_deg, of_b.longitude_deg, of_b.latitude_deg)[2]
         assert apart == pytest.approx(stated, abs=0.06)
-        assert f"{name}: source B lies {apart:.1f} m from source A, which is used" in a.notes
-        assert f"{name}: source A lies {apart:.1f} m from source B, which is used" in b.notes
+        assert f"{name}: the positions in sources A (used) and B differ by {apart:.1f} m" in a.notes
+        assert f"{name}: the positions in sources B (used) and A differ by {apart:.1f} m" in b.notes
     with pytest.raises(UsageError, match="no position 'C'; expected one of A, B"):
         load_site("lake_wheeler", coordinates="C")
 
@@ -144,10 +144,10 @@ def test_the_documented_site_is_valid() -> None:
 
 def test_the_documented_differences_are_the_computed_ones() -> None:
     text = (Path(__file__).parents[2] / "docs" / "site.md").read_text(encoding="utf-8")
-    notes = [note for note in load_site("lake_wheeler").notes if " lies " in note]
+    notes = [note for note in load_site("lake_wheeler").notes if "the positions in sources" in note]
     assert len(notes) == 5
     for note in notes:
-        tower, metres = note[:3], note.split(" lies ")[1].split(" from")[0]
+        tower, metres = note[:3], note.split(" differ by ")[1]
         row = next(line for line in text.splitlines() if line.startswith(f"| {tower} "))
         assert f"| {metres} |" in row
 

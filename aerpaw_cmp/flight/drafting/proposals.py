@@ -287,7 +287,7 @@ class NodeFinder:
             else "no tower fits the levels"
         )
         about = (
-            f"{decided}. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
+            f"{decided}. They fit this place best (90 % region: {estimate.radius90_m:.0f} m), "
             f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where was the node?"
         )
         place = estimate.place_m

@@ -195,9 +195,12 @@ def test_all_identities_of_a_level_count(names: str, rows: tuple[str, str], tmp_
     assert found == [[-95, -94], [-71, -70]]
 
 
-@pytest.mark.parametrize("name", ["Target RSRP", "model RSRP", "RSRP ref", "expected_rsrp"])
+@pytest.mark.parametrize("name", [
+    "Target RSRP", "model RSRP", "RSRP ref", "expected_rsrp", "rsrp_rt", "rsrp_sim", "RSRP (ray tracing)", "rsrpFspl",
+])  # fmt: skip
 def test_a_level_of_a_model_without_an_identity_is_not_a_level(name: str, tmp_path: Path) -> None:
-    assert levels_by_cell(tmp_path / "x.csv", f"PCI,RSRP,{name}", ["11,-70,-95"] * 30) == [[-70]]
+    rows = [f"11,-70,{-95 - i}" for i in range(30)]
+    assert levels_by_cell(tmp_path / "x.csv", f"PCI,RSRP,{name}", rows) == [[-70]]
 
 
 @pytest.mark.parametrize(

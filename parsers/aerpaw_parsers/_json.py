@@ -132,7 +132,7 @@ def first(head: bytes) -> dict[str, Any] | None:
 # Names of objects that only group values and do not describe them.
 _GROUPS = re.compile(
     r"(?:(?<=\.)|^)(?:(?:gps|gnss|pos(?:ition)?|loc(?:ation)?|coord(?:inate)?s?|geo|data|meta(?:data)?|info|sample|record"
-    r"|measurement|(?:decoded_?)?payload|fix|state|telemetry|uplink_?message|\w+_ids)\.)+"
+    r"|measurement|_source|(?:decoded_?)?payload|fix|state|telemetry|uplink_?message|\w+_ids)\.)+"
 )
 # Largest nesting depth of objects and number of list entries that become columns.
 _DEPTH, _ENTRIES = 6, 32

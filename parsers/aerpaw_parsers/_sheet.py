@@ -243,13 +243,13 @@ class Sheet:
         return bool(cells) and all(map(_RAT.fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
-        """Return the column that fits one of the quantities best, an empty column only if there is no other.
+        """Return the column that fits one of the quantities best, or an empty or zero column if there is no other.
 
         Of equally good columns, such as the positions of two receivers, a column that was used before is better.
         """
         known = [
             (
-                not any(cells[i].strip() for cells in self.cells),
+                not any(cells[i].strip(" 0.") for cells in self.cells),
                 dictionary.rank_of(meaning.quantity, self.plain[i]),
                 i not in self.used,
                 i,
@@ -976,13 +976,14 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
     read = partial(
-        _stamps.read, unit=count, european=sheet.has_decimal_commas or _EUROPEAN.search(heads) is not None,
-        zone=zone, gps=gps, day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
+        _stamps.read, unit=count, european=bool(european), zone=zone, gps=gps,
+        day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
     )  # fmt: skip
     if day is not None and len({*sheet.texts(day)}) == 1 and _stamps.passes_midnight(clocks := sheet.texts(column)):
         text = "the dates are all equal, but the clock passes midnight: a day was added to the times after it"
         sheet.notes[day] = f"column {sheet.names[day]!r}: {text}"
         texts, options = clocks, replace(options, time_origin=read(sheet.texts(day)[:1], options)[1][0].decode()[:10])
+    european = sheet.has_decimal_commas or f"{options.timezone}".startswith("Europe/") or _EUROPEAN.search(heads)
     return read(texts, options)
 
 

@@ -139,7 +139,7 @@ def _order(
     date = _date_in_name(name)
     fits = [order for order in ("dmy", "mdy") if date == "{}-{:02d}-{:02d}".format(*_parts(dates[0], order))]
     order = fits[0] if len(fits) == 1 else "dmy" if european else "mdy"
-    reason = "as in countries with decimal commas" if european else "a guess"
+    reason = "as in Europe" if european else "a guess"
     reason = "as in the date of the file name" if len(fits) == 1 else reason
     word = "day" if order == "dmy" else "month"
     warnings.append(
@@ -325,7 +325,7 @@ def read(
     unit : {"ns", "us", "ms", "s", "min", "h"}, optional
         Unit of numbers that count from an unknown origin, according to the name of the column.
     european : bool
-        True if the table has decimal commas: the day then comes before the month.
+        True if the table has decimal commas or a zone of Europe: the day then comes before the month.
     zone : str
         Zone of times without a zone, according to the name of the column.
     gps : bool

@@ -101,6 +101,38 @@ def test_a_column_of_an_unknown_name_that_takes_turns_with_the_level_joins_the_k
     assert sorted(map(sorted, found)) == [[0], [1], [2]]
 
 
+@pytest.mark.parametrize("order", ["turns", "blocks", "at once"])
+@pytest.mark.parametrize("name", [
+    "station", "sensor_id", "Source ID", "src_node", "mac_addr", "neighbor", "Neighbour cell", "serving_cell", "satellite",
+])  # fmt: skip
+def test_a_name_of_a_source_divides_the_levels(name: str, order: str, tmp_path: Path) -> None:
+    """Serving cell and satellite may also be a state and a count: here they are names."""
+    values = {"transmitter": ("G07", "G12", "R03")}
+    rows = rows_of(3, order, 40, random.Random(1))
+    text = written(["timestamp", "transmitter", "rsrp"], rows).replace("transmitter", name)
+    for old, new in zip(IDENTITIES["transmitter"], values["transmitter"], strict=True):
+        text = text.replace(old, new)
+    assert sorted(map(sorted, sources_of(read(tmp_path / "x.csv", text)))) == [[0], [1], [2]]
+
+
+@pytest.mark.parametrize("name", ["is_serving", "Serving Cell", "neighbour", "satellites"])
+def test_a_state_or_a_count_does_not_divide_the_levels(name: str, tmp_path: Path) -> None:
+    rows = [f"-70,{(9 + i // 10) if name == 'satellites' else i // 10 % 2}" for i in range(40)]
+    assert levels_by_cell(tmp_path / "x.csv", f"rsrp,{name}", rows) == [[-70]]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_numbers_in_an_unknown_column_are_reported_if_they_may_be_cells(seed: int, tmp_path: Path) -> None:
+    """A handover is one change. Waypoints are consecutive, heights are round."""
+    chance, count = random.Random(seed), 60
+    name = "x" + "".join(chance.choice("bcdfghjklmnpqrstvwxz") for _ in range(5))
+    cells = [chance.randrange(100) * 4 + 1 + 400 * i for i in range(chance.randrange(2, 5))]
+    for numbers, asked in ((cells, True), (range(1, 5), False), (range(30, 70, 10), False)):
+        rows = "".join(f"{1749564000 + i},{numbers[i * len(numbers) // count]},{-80 - i % 7}\n" for i in range(count))
+        warnings = read(tmp_path / "x.csv", f"time,{name},rsrp\n{rows}").warnings
+        assert any(f"not read: '{name}'" in text for text in warnings) is asked, (numbers, warnings)
+
+
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("in_turns", [True, False])
 def test_names_in_an_unknown_column_divide_the_levels_or_are_reported(

@@ -278,21 +278,22 @@ def _typical(steps: FloatArray) -> float:
     return float(np.median(known)) if len(known) else np.nan
 
 
-# Networks that count from 0, unlike codes of operators.
-_COUNTED = ("sim", "slot", "sub", "anchor", "beacon", "gateway", "peer")
+# Codes of operators, in which 0 is not a network. Other sources may count from 0.
+_CODES = ("operator", "carrier", "provider", "plmn", "network", "mcc", "mnc", "query")
 
 
 def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     """Return the texts of a column, empty where a text is not a name: a network 0 is not, but a device 0 is."""
     meaning = sheet.meanings[column]
-    zero = meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(_COUNTED)
+    code = meaning is not None and meaning.quantity.name == "network" and sheet.plain[column].startswith(_CODES)
+    none = {*_sheet.NO_VALUE, *_NO_IDENTITY, *("0" if code else "")}
     texts = sheet.texts(column)
     # 'lw1', 'LW1' and 'LW-1' are one tower, '3510 MHz' and '3.51 GHz' one carrier
     plain = {text: re.sub(r"(?<=[^\W\d])[-_ ](?=\d)", "", text.casefold()) for text in {*texts}}
     carriers = {text: attributes_of({sheet.plain[column]: text}).get("frequency_hz") for text in plain}
     plain |= {text: f"{hz:.9g}" for text, hz in carriers.items() if isinstance(hz, float)}
     spelling = {plain[text]: text for text in reversed(texts)}
-    named = {text: spelling[plain[text]] if _is_identity(text, zero=zero) else "" for text in {*texts}}
+    named = {text: "" if text.lower() in none else spelling[plain[text]] for text in {*texts}}
     return [named[text] for text in texts]
 
 
@@ -339,11 +340,6 @@ def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:
 
 _SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
 _NO_IDENTITY = ("2147483647", "4294967295", "268435455", "65535", "-1", "9223372036854775807")
-
-
-def _is_identity(text: str, *, zero: bool) -> bool:
-    """Check whether a cell names something."""
-    return text.lower() not in _sheet.NO_VALUE and text not in _NO_IDENTITY and (zero or text != "0")
 
 
 def _label(name: str, value: str) -> str:

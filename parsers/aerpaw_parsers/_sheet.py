@@ -155,6 +155,10 @@ _OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", 
 # The radio access of a cell as programs write it.
 _RAT = re.compile(r"(?i)(lte|nr|[2345]g|gsm|umts|wcdma|e-?utran?)([ _-]?(a|nr|nsa|sa|lte|fdd|tdd|e-?utran?))?")
 _ANY_RAT = re.compile(r"(?i)lte|nr|\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|neigh|serv|detect|^\s*$")
+# Names of cells and satellites in columns that usually contain a state or a count.
+_A_CELL = re.compile(r"(?i)(?!\s*([01](\.0)?|[ps]?cell ?\d*)\s*$).*\d")
+_NAMES_IN = {"serving": _A_CELL, "neighbouring": _A_CELL, "satellites": re.compile(r"\s*[^\W\d_]\w*[- ]?\d")}
+_NETWORK = dictionary.meaning("gateway")
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that need no conversion.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
@@ -232,6 +236,9 @@ class Sheet:
         # a column such as 'radio' may name receivers
         unlike = {i for i in rats if not any(_ANY_RAT.search(row[i]) for row in self.cells[:200])}
         known = [None if i in unlike else what for i, what in enumerate(known)]
+        # 'serving cell' may be a cell and not a state, 'satellite' a satellite and not their number
+        for i, form in ((i, _NAMES_IN.get(what.quantity.name)) for i, what in enumerate(known) if what):
+            known[i] = _NETWORK if form and any(form.match(row[i]) for row in self.cells[:200]) else known[i]
         if rats == unlike:
             of_rats = dictionary.meaning("technology")
             known = [of_rats if what is None and self._names_rats(i) else what for i, what in enumerate(known)]
@@ -345,7 +352,7 @@ class Sheet:
 
     def _parsed(self, column: int, texts: list[str]) -> FloatArray:
         meaning = self.meanings[column]
-        if self._has_points and _are_thousands(texts):
+        if self._has_points and all(_THOUSANDS.fullmatch(text) for text in texts if "," in text):
             texts = [text.replace(",", "") for text in texts]
         elif meaning is not None and meaning.quantity.role == "cell" and self.has_decimal_commas:
             texts = [text.replace(".", "") for text in texts]  # an EARFCN of 2.300 is 2300
@@ -462,13 +469,19 @@ class Sheet:
         return like and any(text.lower() not in NO_VALUE for text in self.texts(column))
 
     def _may_name(self, column: int) -> bool:
-        """Check whether a column with an unknown name has a few texts that may be names of cells or devices."""
+        """Check whether a column with an unknown name has a few texts or numbers that may name cells or devices."""
         if self.meanings[column] is not None or dictionary.PATTERNS["no_identity"].search(self.plain[column]):
             return False
         texts = {text.lower() for text in self.texts(column)} - {*NO_VALUE, *_YES_OR_NO}
-        return 1 < len(texts) <= _MOST_SOURCES and all(
-            _LETTER.search(text) and math.isnan(_number(text)[0]) for text in texts
-        )
+        if not 1 < len(texts) <= _MOST_SOURCES:
+            return False
+        if not all(text.isdecimal() for text in texts):
+            return all(_LETTER.search(text) and math.isnan(_number(text)[0]) for text in texts)
+        # unlike waypoints and heights, numbers of cells are neither consecutive nor round; unlike counts, they are few
+        numbers = np.unique([int(text) for text in texts])
+        few = np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any() and len(numbers) <= _MOST_NUMBERS
+        levels = any((what := self.meanings[i]) and what.quantity.role == "rss" for i in self.used)
+        return bool(few and levels and self.find("PCI") is None)
 
 
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
@@ -479,7 +492,7 @@ _GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(
 _MOST_EQUAL = 0.3
 _YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
 # Names contain a letter. A column with more texts than this counts something.
-_LETTER, _MOST_SOURCES = re.compile(r"[^\W\d_]"), 50
+_LETTER, _MOST_SOURCES, _MOST_NUMBERS = re.compile(r"[^\W\d_]"), 50, 8
 # Largest number of column names in one sentence.
 _MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
@@ -489,11 +502,6 @@ _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,40})?")
 NO_VALUE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "-infinity", "unavailable",
             "unknown", "invalid"}  # fmt: skip
 _NO_ZONE = {*NO_VALUE, "local", "local time"}
-
-
-def _are_thousands(texts: Sequence[str]) -> bool:
-    """Check whether the commas of a column separate thousands: ``1,300`` and never ``35,72``."""
-    return any("," in text for text in texts) and all(_THOUSANDS.fullmatch(text) for text in texts if "," in text)
 
 
 def read(data: bytes, is_header: _IsHeader) -> Sheet:
@@ -975,6 +983,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     gps = re.search(r"\bgps", name) is not None
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
+    european = sheet.has_decimal_commas or f"{options.timezone}".startswith("Europe/") or _EUROPEAN.search(heads)
     read = partial(
         _stamps.read, unit=count, european=bool(european), zone=zone, gps=gps,
         day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
@@ -983,7 +992,6 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         text = "the dates are all equal, but the clock passes midnight: a day was added to the times after it"
         sheet.notes[day] = f"column {sheet.names[day]!r}: {text}"
         texts, options = clocks, replace(options, time_origin=read(sheet.texts(day)[:1], options)[1][0].decode()[:10])
-    european = sheet.has_decimal_commas or f"{options.timezone}".startswith("Europe/") or _EUROPEAN.search(heads)
     return read(texts, options)
 
 

@@ -197,10 +197,9 @@ def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
     import pandas as pd
 
     cells = part.tolist()
-    code = {}
-    for cell in dict.fromkeys(cells):  # a text column has few different values
-        text = None if pd.isna(cell) else str(cell)
-        code[cell] = number.setdefault(text, len(number) - 1)
+    # a text column has few different values
+    texts = {cell: None if pd.isna(cell) else str(cell) for cell in dict.fromkeys(cells)}
+    code = {cell: number.setdefault(text, len(number) - 1) for cell, text in texts.items()}
     return np.fromiter(map(code.__getitem__, cells), np.int32, len(cells))
 
 

@@ -29,6 +29,7 @@ from ..common.text import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from . import dictionary
 from .records import ReadResult, Stream
+from .text import UNTERMINATED, add_flag
 
 FASTEST_MPS = 100.0
 FLAG, STALE = "position_jump", "position_stale"
@@ -513,9 +514,7 @@ class _Check:
 
 def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: Sequence[str]) -> pd.DataFrame:
     column: AnyArray = frame["flag"].to_numpy(dtype=object).copy()
-    for i in np.flatnonzero(bad):
-        words = str(column[i]).split(";") if column[i] else []
-        column[i] = ";".join([*words, flag] if flag not in words else words)
+    add_flag(column, bad, flag)
     out: pd.DataFrame = frame.copy(deep=False)  # copy the columns that get flags
     out["flag"] = pd.Series(column, index=frame.index, dtype=object)
     for name in void:

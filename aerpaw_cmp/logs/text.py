@@ -34,6 +34,8 @@ TEXT_LIMIT = 500
 # Flag of a record in a last line without line end: its last field may be cut short.
 UNTERMINATED = "unterminated_line"
 
+# Why a line with NUL bytes is rejected.
+NUL = "NUL bytes in the line (the file system was not synced when the power failed)"
 
 # First bytes of markup files, which are not consoles or tables.
 MARKUP = (b"<?xml", b"<kml", b"<gpx")
@@ -223,8 +225,6 @@ def remainder(
     """
     unaccounted = np.ones(len(lines), dtype=bool)
     unaccounted[accepted] = False
-    if not unaccounted.any() and blank is None:
-        return 0, []
     known = lines.blank & unaccounted
     if blank is not None:
         known[blank] = True
@@ -235,7 +235,7 @@ def remainder(
         if why is None:
             count += 1
         else:
-            rejected.append(lines.reject(int(i), why))
+            rejected.append(lines.reject(int(i), NUL if b"\0" in line else why))
     return count, rejected
 
 
@@ -440,12 +440,9 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Return the starts of runs within a quarter of an hour, the distinct quarters, and the quarter of each run."""
-    if len(wall_ns) == 0:
-        none = np.zeros(0, dtype=np.int64)
-        return none, none, none
     # look up the zone once per quarter of an hour
     bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
-    starts = np.flatnonzero(np.concatenate(([True], bucket[1:] != bucket[:-1])))
+    starts = np.flatnonzero(np.diff(bucket, prepend=bucket[:1] - 1))
     unique, index = np.unique(bucket[starts], return_inverse=True)
     return starts, unique, index
 
@@ -473,14 +470,12 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     valid : bool array, shape (n,)
         True for a date of the calendar and a time of day.
     """
-    count = len(cells)
-    if count == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
     # Times increase, so parse each date and minute once per run of equal values. Sixteen characters are compared as two
     # integers per row.
     half = np.ascontiguousarray(cells[:, :16]).view(np.uint64)
-    starts = np.flatnonzero(np.concatenate(([True], (half[1:, 0] != half[:-1, 0]) | (half[1:, 1] != half[:-1, 1]))))
-    length = np.diff(np.append(starts, count))
+    unlike = (half[1:, 0] != half[:-1, 0]) | (half[1:, 1] != half[:-1, 1])
+    starts = np.flatnonzero(np.concatenate(([True], unlike))[: len(cells)])
+    length = np.diff(np.append(starts, len(cells)))
     minute, dated = _minutes(cells[starts, :16])
     valid = np.repeat(dated, length)
     second, worst = integers(cells[:, 17:19])

@@ -19,19 +19,8 @@ from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import dictionary
 from aerpaw_cmp.logs.readers import unknown_name
-from aerpaw_cmp.readers import (
-    COLUMNS,
-    Kind,
-    Lines,
-    Reader,
-    ReadOptions,
-    ReadResult,
-    Rows,
-    Stream,
-    add_flag,
-    no_flags,
-    split,
-)
+from aerpaw_cmp.logs.text import Lines, add_flag, no_flags, split
+from aerpaw_cmp.readers import COLUMNS, Kind, Reader, ReadOptions, ReadResult, Rows, Stream
 
 from . import _identity, _pose, _sheet
 

@@ -12,17 +12,8 @@ import re
 import numpy as np
 
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.readers import (
-    OtherLines,
-    Reader,
-    ReadOptions,
-    ReadResult,
-    RejectedLine,
-    Rows,
-    Stream,
-    built,
-    checked_ranks,
-)
+from aerpaw_cmp.logs.rows import Rows, built, checked_ranks
+from aerpaw_cmp.readers import OtherLines, Reader, ReadOptions, ReadResult, RejectedLine, Stream
 
 from . import _cells
 

@@ -115,8 +115,6 @@ def _is_known(head: bytes) -> bool:
 def _reason(line: bytes) -> str | None:
     if line.strip() == b"OK":
         return None  # the start script wrote this line, not the modem
-    if b"\0" in line:
-        return "NUL bytes in the line (the file system was not synced when the power failed)"
     if line.startswith(b"[") and _TALK.match(line):
         return None  # commands and other answers of a console
     if not re.match(rb"\[?" + TIME, line):

@@ -155,7 +155,7 @@ def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
 
 def _reason(line: bytes) -> str:
     if b"\0" in line:
-        return "NUL bytes in the line (the file system was not synced when the power failed)"
+        return _text.NUL
     if not line.startswith(b"["):
         return "the line does not begin with '[time]', which the program 'ts' writes"
     if not re.match(_HEAD, line):

@@ -71,8 +71,6 @@ _TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|ind
 def _reason(line: bytes) -> str | None:
     if _TITLE.match(line):
         return None  # the title line of converted logs
-    if b"\0" in line:
-        return "NUL bytes in the line (the file system was not synced when the power failed)"
     fields = len(re.sub(rb"\([^()]*\)", b"", line).split(b","))
     if fields not in (8, 9, 10, 11):
         return f"{fields} fields where 8, 9, 10 or 11 were expected (truncated line?)"

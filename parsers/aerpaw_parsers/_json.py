@@ -228,23 +228,6 @@ def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def ue_ranks(rows: Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadResult:
-    """Return the rank streams of UEs, pairs of row and object, with those keys that are in the dictionary."""
-    entries = [ue for _, ue in ues]
-    none = np.full(len(entries), np.nan)
-    columns = {"rank": none, "cqi": none, "mcs": none, "rnti": column(entries, "rnti")}
-    for key in dict.fromkeys(key for entry in entries for key in entry):
-        what = dictionary.meaning(key)
-        if what is not None and not what.indirect and (name := what.quantity.name.lower()) in _OF_UE:
-            before = columns.get(name, none)
-            columns[name] = np.where(np.isnan(before), column(entries, key), before)
-    pick = np.array([i for i, _ in ues], dtype=np.int64)
-    return rows.result(mean_rank(rows, columns.pop("rank"), columns, pick=pick))
-
-
-_OF_UE = ("rank", "cqi", "mcs", "pci")
-
-
 def bracket(line: bytes) -> str | None:
     """Return the reason for lines that are not objects, or None for the brackets of an array."""
     return None if line.strip() in (b"[", b"]") else "not a JSON object"

@@ -81,7 +81,13 @@ def _ues(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
-    """Return the rank stream ``gnb`` with a record per UE and report."""
+    """Return the rank stream ``gnb`` with a record per UE and report, and those keys that are in the dictionary.
+
+    Raises
+    ------
+    InputError
+        If no UE has a rank.
+    """
     lines = _text.split(data)
     reports = _json.objects(lines)
     row, entries = reports.row, reports.values
@@ -100,7 +106,20 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     )  # fmt: skip
     rows.warnings += warnings
     pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(entries[with_ue[at]])]
-    return _json.ue_ranks(rows, pairs)
+    pick, ues = np.array([i for i, _ in pairs], dtype=np.int64), [ue for _, ue in pairs]
+    none = np.full(len(ues), np.nan)
+    columns = {"rank": none, "cqi": none, "mcs": none, "rnti": _json.column(ues, "rnti")}
+    for key in dict.fromkeys(key for ue in ues for key in ue):
+        what = dictionary.meaning(key)
+        if what is not None and not what.indirect and (name := what.quantity.name.lower()) in _OF_UE:
+            before = columns.get(name, none)
+            columns[name] = np.where(np.isnan(before), _json.column(ues, key), before)
+    if len(ues) and np.isnan(columns["rank"]).all():
+        raise InputError("no UE has a rank indicator", expected="'ri' or 'dl_ri' of UEs", cause="another version")
+    return rows.result(mean_rank(rows, columns.pop("rank"), columns, pick=pick))
+
+
+_OF_UE = ("rank", "cqi", "mcs", "pci")
 
 
 READER = Reader(

@@ -142,3 +142,9 @@ def test_objects_over_several_lines_are_read_behind_any_number_of_damaged_ones()
     assert [entry["timestamp"] for entry in parsed.values] == [1740927601.25]
     assert len(parsed.rejected) == 40
     assert parsed.row.tolist() == [40]
+
+
+def test_reports_without_ranks_are_refused() -> None:
+    data = re.sub(rb'"(dl_)?ri":', b'"dl_mcs_x":', samples.FILES["srsran_json/metrics"])
+    with pytest.raises(InputError, match="no UE has a rank"):
+        read("srsran_json", data)

@@ -821,6 +821,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
     if column is None and weeks is None and (date := sheet.find("date")) is not None:
         # a column such as 'Date' with the date and the time of day, or with fractions of days
+    if column is not None and options.time_origin is None and not sheet.closed:
+        _add_date_above(sheet, column)
         column = date if _is_dated(sheet, date) or (sheet.numbers(date) % 1 > 0).any() else None
     times = (column, sheet.find("time") if weeks is not None else None, *map(sheet.find, _OF_CLOCK))
     sheet.used |= {i for i in times if i is not None}
@@ -861,6 +863,19 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
 _NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds", "header stamp nsecs", "header stamp nanosec")
 _OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
 # Start of a log in a cell of JSON, written by Open DroneLog together with relative times.
+def _add_date_above(sheet: Sheet, time: int) -> None:
+    """Add a column with the date in the lines above the header, if the table has only times of day."""
+    if sheet.find("date") is not None or not _OF_DAY.match(next(filter(None, sheet.texts(time)), "")):
+        return
+    above = [sheet.lines.raw(i).decode("utf-8", "replace") for i in range(min(int(sheet.row[0]), TITLES))]
+    dates = {date: (i + 1, text) for i, text in enumerate(above) if (date := _stamps.date_in(text))}
+    for date, (line, text) in dates.items() if len(dates) == 1 else ():
+        sheet.add("date utc" if re.search(r"\b(UTC|GMT)\b", text) else "date", [date] * len(sheet))
+        sheet.notes[len(sheet.names)] = f"the times have no date: that in line {line} is used, {text.strip()[:60]!r}"
+
+
+# A time of day without a date.
+_OF_DAY = re.compile(r"T?\d{1,2}:\d\d[:\d.,]*([AP]M|Z)?$")
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
 
 
@@ -991,7 +1006,9 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and len({*sheet.texts(day)}) == 1 and _stamps.passes_midnight(clocks := sheet.texts(column)):
         text = "the dates are all equal, but the clock passes midnight: a day was added to the times after it"
         sheet.notes[day] = f"column {sheet.names[day]!r}: {text}"
-        texts, options = clocks, replace(options, time_origin=read(sheet.texts(day)[:1], options)[1][0].decode()[:10])
+        dated = replace(options, time_origin=read(sheet.texts(day)[:1], options)[1][0].decode()[:10])
+        clock, cells, warnings = read(clocks, dated)
+        return clock, cells, [text for text in warnings if "time_origin" not in text]
     return read(texts, options)
 
 

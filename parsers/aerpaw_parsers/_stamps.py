@@ -75,12 +75,12 @@ _WITH_SUMMER = dictionary.ZONES["with_summer"]
 _OFFSET = re.compile(r"(?:UTC|GMT)? ?([+-])(\d{1,2}):?(\d\d)?")
 
 
-def _date_in_name(name: str) -> str | None:
-    """Return the date in a file name.
+def date_in(name: str) -> str | None:
+    """Return the date in a file name or in a line of text.
 
     Examples
     --------
-    >>> _date_in_name("24Feb09_172055.1.gpx"), _date_in_name("2022-06-10_19:52:44_log.txt"), _date_in_name("60m.csv")
+    >>> date_in("24Feb09_172055.1.gpx"), date_in("2022-06-10_19:52:44_log.txt"), date_in("60m.csv")
     ('2024-02-09', '2022-06-10', None)
     """
     for pattern in _IN_NAME:
@@ -136,7 +136,7 @@ def _order(
         spans_d[order] = max(days) - min(days)
     if abs(spans_d["dmy"] - spans_d["mdy"]) >= _WEEKS_D:
         return min(spans_d, key=lambda order: spans_d[order]), warnings
-    date = _date_in_name(name)
+    date = date_in(name)
     fits = [order for order in ("dmy", "mdy") if date == "{}-{:02d}-{:02d}".format(*_parts(dates[0], order))]
     order = fits[0] if len(fits) == 1 else "dmy" if european else "mdy"
     reason = "as in Europe" if european else "a guess"
@@ -614,7 +614,7 @@ def _on_a_date(
     seconds: FloatArray, options: ReadOptions, warnings: list[str], zone: str = ""
 ) -> tuple[str, AnyArray, list[str]]:
     """Return seconds after the first midnight as dated times, or as relative times if the day is unknown."""
-    date = options.time_origin[:10] if options.time_origin else _date_in_name(options.file_name)
+    date = options.time_origin[:10] if options.time_origin else date_in(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
     cells = _wall_cells(np.datetime64(date, "us"), seconds, zone, options)

@@ -488,6 +488,11 @@ def like_levels(names: Iterable[str]) -> list[str]:
     ]  # fmt: skip
 
 
+def is_statistic(name: str) -> bool:
+    """Check whether a name contains a word for a mean, a maximum or a prediction."""
+    return any(PATTERNS[kind].search(plain(name)) for kind in ("mean", "indirect"))
+
+
 def can_be_level(name: str) -> bool:
     """Check whether the unit in a name, if it is known, is that of a level, not that of a field strength or height."""
     return UNITS.get(without_unit(name)[1], ("dBm",))[0] in ("dBm", "dB", _FULL_SCALE)

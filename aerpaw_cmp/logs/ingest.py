@@ -514,7 +514,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     with parsing(path, expected, cause), blaming(reader.plugin, f"reader {reader.name!r} read it", InputError):
         result = readers.stated(limits.check(_later(read(), options.gps_rollovers)), reader, options)
     if not any(len(stream.frame) for stream in result.streams):
-        first = f": {result.rejected[0].reason}" if result.rejected else ""
+        first = f": {result.rejected[0].reason}: {result.rejected[0].text[:80]!r}" if result.rejected else ""
         raise InputError(
             f"reader {reader.name!r} found no record in {counted(result.lines, 'line')}{first}",
             expected=f"lines such as {reader.sample!r}",

@@ -448,8 +448,11 @@ class _Check:
     def _lost_readings(self) -> None:
         """Flag a few placeholders far from all other levels, which programs write for lost readings."""
         level = self._values("rss_db")
+        cut = (self.frame["flag"] == UNTERMINATED).to_numpy()  # -92 may have become -9
         # -1 is also a common placeholder
-        for lost, sign, word in ((np.abs(level) <= _LOST_DB, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):
+        for lost, sign, word in (
+            (np.abs(level) <= _LOST_DB, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below"), (cut, 1, "above")
+        ):  # fmt: skip
             known = np.isfinite(level).sum()
             if not lost.any() or lost.sum() > max(1, _LOST_SHARE * known) or known < _FEW_ROWS:
                 continue

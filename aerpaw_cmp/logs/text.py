@@ -231,7 +231,8 @@ def remainder(
     count = int(known.sum())
     rejected: list[RejectedLine] = []
     for i in np.flatnonzero(unaccounted & ~known):
-        why = reason(lines.raw(int(i)))
+        line = lines.raw(int(i))
+        why = reason(line)
         if why is None:
             count += 1
         else:

@@ -287,7 +287,7 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     meaning = sheet.meanings[column]
     code = meaning is not None and meaning.quantity.name == "network" and sheet.plain[column].startswith(_CODES)
     none = {*_sheet.NO_VALUE, *_NO_IDENTITY, *("0" if code else "")}
-    texts = sheet.texts(column)
+    texts = [_FLOAT.sub(r"\1", text) for text in sheet.texts(column)]
     # 'lw1', 'LW1' and 'LW-1' are one tower, '3510 MHz' and '3.51 GHz' one carrier
     plain = {text: re.sub(r"(?<=[^\W\d])[-_ ](?=\d)", "", text.casefold()) for text in {*texts}}
     carriers = {text: attributes_of({sheet.plain[column]: text}).get("frequency_hz") for text in plain}
@@ -295,6 +295,10 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     spelling = {plain[text]: text for text in reversed(texts)}
     named = {text: "" if text.lower() in none else spelling[plain[text]] for text in {*texts}}
     return [named[text] for text in texts]
+
+
+# Pandas writes integers of a column with missing values as floats.
+_FLOAT = re.compile(r"^(\d+)\.0+$")
 
 
 def cell_names(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[str, dict[str, Attribute]]]:

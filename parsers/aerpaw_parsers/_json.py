@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.readers import FloatArray, IntArray, Lines, ReadResult, RejectedLine, Rows, dictionary, mean_rank
+from aerpaw_cmp.readers import FloatArray, IntArray, Lines, RejectedLine, dictionary
 
 _MOST_LINES = 5000
 # Largest total size [bytes] of incomplete objects that are tried over several lines, as a limit on time.

@@ -250,13 +250,15 @@ class Sheet:
         return bool(cells) and all(map(_RAT.fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
-        """Return the column that fits one of the quantities best, or an empty or zero column if there is no other.
+        """Return the column that fits one of the quantities best, an empty column only if there is no other.
 
-        Of equally good columns, such as the positions of two receivers, a column that was used before is better.
+        A height of 0 in all rows counts as empty. Of equally good columns, such as the positions of two receivers, a
+        column that was used before is better.
         """
+        blank = " 0." if "altitude_m" in quantities else None
         known = [
             (
-                not any(cells[i].strip(" 0.") for cells in self.cells),
+                not any(cells[i].strip(blank) for cells in self.cells),
                 dictionary.rank_of(meaning.quantity, self.plain[i]),
                 i not in self.used,
                 i,
@@ -364,7 +366,8 @@ class Sheet:
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
         told = {text: count for text, count in counts.items() if text.lower() not in NO_VALUE}
         words = {text: count for text, count in told.items() if math.isnan(parsed[text][0])}
-        if meaning is not None and 2 * sum(words.values()) > sum(told.values()):
+        of_level = meaning is not None and meaning.quantity.role == "rss"
+        if meaning is not None and 2 * sum(words.values()) > (0 if of_level else sum(told.values())):
             self.notes[column] = (
                 f"column {self.names[column]!r}: {counted(sum(words.values()), 'cell')} without a number (the first: "
                 f"{next(iter(words))[:30]!r}) are read as missing"
@@ -818,11 +821,11 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     column = _time_column(sheet, options) if column is None else column
+    if column is not None and options.time_origin is None and not sheet.closed:
+        _add_date_above(sheet, column)
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
     if column is None and weeks is None and (date := sheet.find("date")) is not None:
         # a column such as 'Date' with the date and the time of day, or with fractions of days
-    if column is not None and options.time_origin is None and not sheet.closed:
-        _add_date_above(sheet, column)
         column = date if _is_dated(sheet, date) or (sheet.numbers(date) % 1 > 0).any() else None
     times = (column, sheet.find("time") if weeks is not None else None, *map(sheet.find, _OF_CLOCK))
     sheet.used |= {i for i in times if i is not None}
@@ -860,9 +863,6 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     return timed
 
 
-_NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds", "header stamp nsecs", "header stamp nanosec")
-_OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
-# Start of a log in a cell of JSON, written by Open DroneLog together with relative times.
 def _add_date_above(sheet: Sheet, time: int) -> None:
     """Add a column with the date in the lines above the header, if the table has only times of day."""
     if sheet.find("date") is not None or not _OF_DAY.match(next(filter(None, sheet.texts(time)), "")):
@@ -876,6 +876,9 @@ def _add_date_above(sheet: Sheet, time: int) -> None:
 
 # A time of day without a date.
 _OF_DAY = re.compile(r"T?\d{1,2}:\d\d[:\d.,]*([AP]M|Z)?$")
+_NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds", "header stamp nsecs", "header stamp nanosec")
+_OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
+# Start of a log in a cell of JSON, written by Open DroneLog together with relative times.
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
 
 
@@ -1072,7 +1075,7 @@ def unread_levels(sheet: Sheet) -> list[int]:
         # a level in dBm is negative: other numbers are percentages or steps
         and (sheet.unit_read(i) == "dB" or np.nanmedian(sheet.numbers(i)) < 0)
     ]  # fmt: skip
-    return sorted(named, key=lambda i: sheet.unit(i) != "dbm")
+    return sorted(named, key=lambda i: (dictionary.is_statistic(sheet.names[i]), sheet.unit(i) != "dbm"))
 
 
 def way_to_level(sheet: Sheet) -> list[str]:
@@ -1201,11 +1204,11 @@ def _add_milliseconds(rows: Rows, milliseconds: FloatArray) -> None:
     fits = np.abs(counted_ns).max() < _MOST_NS
     counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
     zero = (time - counted)[known]
-    if not fits or zero.max() - zero.min() > _MOST_APART_NS:
-        if fits and (counted >= 0).all() and (counted < 1_000_000_000).all():
-            # the column contains the fraction of each second, not the time since the start
-            rows.time = (time + counted).astype("datetime64[ns]")
-            return
+    counts_on = ((np.diff(time) > 0) & (np.diff(counted) > 0)).any()  # fractions begin again with each second
+    spread = zero.max() - zero.min()
+    if fits and 0 <= counted.min() <= counted.max() < 1_000_000_000 and not (counts_on and spread <= _MOST_APART_NS):
+        rows.time = (time + counted).astype("datetime64[ns]")
+    elif fits and spread <= _MOST_APART_NS:
+        rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")
+    else:
         rows.warnings.append("the column of milliseconds does not fit the times and is not used")
-        return
-    rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")

@@ -28,7 +28,7 @@ _CLOCK = (
     r"(?P<hour>\d{1,2})[:.h_-](?P<minute>\d\d)(?:[:.m_-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,40}))?s?)?(?: Uhr)?"
     r" ?(?P<half>[AaPp]\.? ?[Mm]\.?)?"
 )
-_GAP = r"[T _,.:;-]{1,3}(?:at )?"
+_GAP = r"[T _,.:;-]{1,3}(?:(?:at|@) )?"
 _DAY = r"(?:[^\W\d_]{2,10}[., ]{1,3})?"  # a day of the week in any language
 _WORD = r"(?P<word>[^\W\d_]{3,10})\.?"
 # The date before the clock; date(1) writes the year and the zone after it.

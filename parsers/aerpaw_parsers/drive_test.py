@@ -189,7 +189,11 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
         if "pci" in cell.columns and role == "serving" and not homes:
             near = [home for home in levels.values() if not home.place.startswith("n")]
             homes = [home for home in near if not rat or home.rat in ("", rat)]
-        if len(homes) == 1:
+        if {*cell.columns} == {"arfcn"} and role == "serving" and not homes:
+            homes = [home for home in levels.values() if not rat or home.rat in ("", rat)]
+            for home in homes:  # the carrier of a scan belongs to all cells of the row
+                home.columns = {**cell.columns, **home.columns}
+        elif len(homes) == 1:
             (home,) = homes
             home.rat = home.rat or rat
             twice = [name for name in cell.columns if name in home.columns and name not in _IDENTITY]

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.logs import dictionary
 from aerpaw_cmp.logs import text as _text
-from aerpaw_cmp.readers import OtherLines, Reader, ReadOptions, ReadResult, built, matched, mean_rank
+from aerpaw_cmp.readers import InputError, OtherLines, Reader, ReadOptions, ReadResult, built, matched, mean_rank
 
 from . import _json, _stamps
 

@@ -115,6 +115,13 @@ def test_a_name_of_a_source_divides_the_levels(name: str, order: str, tmp_path: 
     assert sorted(map(sorted, sources_of(read(tmp_path / "x.csv", text)))) == [[0], [1], [2]]
 
 
+@pytest.mark.parametrize("name", ["pci", "eNB ID", "cell_id", "sim_slot", "rnti", "earfcn", "station"])
+def test_numbers_with_a_decimal_are_the_same_sources(name: str, tmp_path: Path) -> None:
+    """Pandas writes the integers of a column with missing values as 11.0."""
+    rows = [f"{-70 - 25 * (i % 2)},{(11, 12)[i % 2]}{'.0' if i > 9 else ''}" for i in range(40)]
+    assert levels_by_cell(tmp_path / "x.csv", f"rsrp,{name}", rows) == [[-95], [-70]]
+
+
 @pytest.mark.parametrize("name", ["is_serving", "Serving Cell", "neighbour", "satellites"])
 def test_a_state_or_a_count_does_not_divide_the_levels(name: str, tmp_path: Path) -> None:
     rows = [f"-70,{(9 + i // 10) if name == 'satellites' else i // 10 % 2}" for i in range(40)]

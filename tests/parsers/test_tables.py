@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import _sheet
@@ -409,3 +411,92 @@ def test_seconds_of_a_whole_minute_are_read_without_a_question() -> None:
     rows = "".join(f"{0.5 * i},35.72,-78.69,30,-80\n" for i in range(200))
     result = drive_test((SIX_COLUMNS + rows).encode(), time_origin="2025-03-02T15:00:00Z")
     assert not any("without a unit" in text for text in result.warnings)
+
+
+# --- what the lines above a table, other columns and the last line decide ----------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("title", "hours", "line"),
+    [("# recording date: 2025-03-14 UTC", 0, 1), ("Messung\n# date 2025-03-14, by X", 4, 2), ("20250314 GMT", 0, 1)],
+)
+def test_times_of_the_day_have_the_date_above_the_table(title: str, hours: int, line: int) -> None:
+    data = f"{title}\ntod,pci,rsrp_dbm\n23:59:58,12,-80\n23:59:59.5,12,-81\n00:00:00,12,-82\n".encode()
+    result = by_name("drive_test").read(data, ReadOptions(timezone="America/New_York"))
+    began = np.datetime64("2025-03-14T23:59:58", "ns") + np.timedelta64(hours, "h")
+    seconds = (result.streams[0].frame["time"].to_numpy() - began) / np.timedelta64(1, "s")
+    assert seconds.tolist() == [0, 1.5, 2]
+    assert any(f"that in line {line} is used" in text for text in result.warnings)
+
+
+def test_two_dates_above_a_table_are_not_used() -> None:
+    data = b"# made 2025-03-14\n# calibrated 2024-01-02\ntod,pci,rsrp_dbm\n10:00:00,12,-80\n10:00:01,12,-81\n"
+    assert by_name("drive_test").read(data, ReadOptions()).streams[0].frame["time"][0].year == 1970
+
+
+@pytest.mark.parametrize(
+    ("fractions", "seconds"),
+    [
+        ([100, 400, 900], [0.1, 0.4, 0.9]),  # within one second
+        ([700, 900, 100], [0.7, 0.9, 1.1]),
+        ([237, 238, 239], [0.237, 1.238, 2.239]),
+    ],
+)
+def test_milliseconds_below_a_second_are_fractions(fractions: list[int], seconds: list[float]) -> None:
+    whole = [int(value) for value in seconds]
+    rows = "".join(
+        f"2025-03-02 10:00:0{s},{ms},35.73,-78.7,{i}\n" for i, (s, ms) in enumerate(zip(whole, fractions, strict=True))
+    )
+    time = read("pose_csv", f"datetime(utc),ms,lat,lon,alt\n{rows}".encode()).streams[0].frame["time"].to_numpy()
+    assert ((time - np.datetime64("2025-03-02T10:00:00")) / np.timedelta64(1, "s")).tolist() == pytest.approx(seconds)
+
+
+def test_a_last_level_that_was_cut_off_is_not_scored(tmp_path: Path) -> None:
+    path, rows = tmp_path / "x.csv", "".join(f"{1749564000 + i},11,{-90 - i % 3}\n" for i in range(20))
+    for last, flag in (("-9", "unterminated_line;level_lost"), ("-92", "unterminated_line")):
+        path.write_text(f"time,pci,rsrp\n{rows}1749564020,11,{last}")
+        (file,) = ingest([path])
+        assert file.result.streams[0].frame["flag"].iloc[-1] == flag
+        assert any("level_lost" in text for text in file.result.warnings) is ("lost" in flag)
+
+
+def test_the_carrier_of_a_scan_is_that_of_all_its_cells() -> None:
+    rows = "".join(f"{1749564000 + i};{(1300, 2850)[i // 6]};11;{-70 - i % 2};12;-90\n" for i in range(12))
+    result = read("drive_test", f"time;EARFCN;PCI_1;RSRP_1;PCI_2;RSRP_2\n{rows}".encode())
+    assert {(s.attributes["pci"], s.attributes["arfcn"]) for s in result.streams} == {
+        (pci, arfcn) for pci in (11, 12) for arfcn in (1300, 2850)
+    }
+
+
+def test_words_in_a_column_of_levels_are_counted() -> None:
+    data = b"time,pci,rsrp\n1749564000,11,-80\n1749564001,11,<-110\n1749564002,11,-81\n"
+    assert any("'<-110'" in text for text in read("drive_test", data).warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "first"),
+    [
+        ("drive_test", '{{"_index": "m", "_source": {{"@timestamp": "{time}Z", "modem": {{"pci": 11, "rsrp": -80}}}}}}', "2025-03-02T15:00:00"),
+        ("drive_test", "@timestamp,pci,rsrp\n\"Mar 2, 2025 @ 10:00:00.000\",11,-80", "2025-03-02T15:00:00"),
+        ("pose_csv", "%time,field.header.stamp,field.latitude,field.longitude,field.altitude\n1740927600120000000,1740927600000000000,35.7,-78.7,80", "2025-03-02T15:00:00"),
+    ],
+)  # fmt: skip
+def test_times_of_other_programs(name: str, text: str, first: str) -> None:
+    data = f"{text.format(time=first)}\n".encode()
+    assert by_name(name).sniff(data)
+    assert read(name, data).streams[0].frame["time"][0] == np.datetime64(first)
+
+
+def test_a_height_of_zeros_hides_no_other_height() -> None:
+    rows = "".join(f"2025-03-02 10:00:{i:02d},35.73,-78.7,{120 + 2 * i},0\n" for i in range(12))
+    (track,) = read("pose_csv", f"datetime(utc),latitude,longitude,altitude(m),ascent(m)\n{rows}".encode()).streams
+    assert track.frame["altitude_m"].iloc[-1] - track.frame["altitude_m"].iloc[0] == 22
+
+
+def test_the_day_comes_first_in_europe() -> None:
+    data = b"time,pci,rsrp\n03/04/2025 10:00:00,11,-80\n03/04/2025 10:00:01,11,-81\n"
+    months = {
+        zone: read("drive_test", data, timezone=zone).streams[0].frame["time"][0].month
+        for zone in ("Europe/Paris", "America/New_York")
+    }
+    assert months == {"Europe/Paris": 4, "America/New_York": 3}

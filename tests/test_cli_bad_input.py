@@ -98,6 +98,16 @@ def test_bad_logs(run: Run, name: str, files: dict[str, bytes | str | None], cod
         (("  - {path: vehicleOut.txt, reader: vehicle_out}\n", ""), "no telemetry"),
         (("rt: {audit_links: 0}", "rt: {audit_links: 0, max_depth: 9}"), "max_depth"),
         (('rss: {lag: "off"}', "rss: {advanced: {lag_window_s: 0.01}}"), "lag_window_s"),
+        (
+            ("rt:", "  - {path: power_log.txt, node: LW1, channel: USRP1}\nrt:"),
+            "Likely cause: a log that is listed twice",
+        ),
+        (('lag: "off"', "lag: 1e15"), "rss.lag: found 1000000000000000.0; expected less than or equal to 86400"),
+        (
+            ("rt:", "link: {rss: {carrier_hz: 3e9, transmit_power_dbm: 1e300}}\nrt:"),
+            "expected less than or equal to 100",
+        ),
+        (("America/New_York", "EST"), "or Etc/GMT+5 (without). Next: fix flight.yaml and run the same command"),
         (("rt:", "link: {rss: {carrier_hz: 60e9}}\nrt:"), "Next: fix flight.yaml and run the same command"),
     ],
 )

@@ -349,7 +349,9 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         if not settings and words[:1] in _OF_LOGS:
             return f"'aerpaw-cmp ingest {one_line(str(place))} --draft flight.yaml' writes one from its logs"
     settings_file = next((word for word in arguments if word.endswith(_SETTINGS)), None)
-    if place is None and settings_file and words[:1] in _OF_SETTINGS and "--" not in f"{error.found} {error.expected}":
+    # a log without a time zone is correct: the key is missing in the settings
+    in_file = place is None or "timezone:" in (error.expected or "")
+    if in_file and settings_file and words[:1] in _OF_SETTINGS and "--" not in error.found:
         return f"fix {one_line(Path(settings_file).name)} and run the same command"
     if place is None or not isinstance(error, InputError):
         return f"'{command} --help' lists the options"
@@ -383,7 +385,7 @@ def _nearest(place: Path) -> str:
     while not _exists(folder) and folder != folder.parent:
         folder = folder.parent
     try:
-        names = [item.name for item in folder.iterdir()]
+        names = [item.name for item in folder.iterdir() if item.name != place.name]
     except OSError:
         names = []
     # suggest close matches only: a loose match could be another flight's file

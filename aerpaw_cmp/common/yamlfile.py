@@ -396,7 +396,7 @@ def _kind(keys: Iterable[str]) -> str | None:
 
 
 # Parts of a location that name the tried member of a union. No key of this package has such a name.
-_MEMBER = re.compile(r"literal\[.*\]|float|int|str|bool")
+_MEMBER = re.compile(r"literal\[.*\]|(constrained-)?float|int|str|bool")
 
 # What is expected, by pydantic's name of the error.
 _KINDS = {

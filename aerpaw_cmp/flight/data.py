@@ -936,7 +936,8 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
             if path == later_path:
                 where = f"two streams of one log contain {what}"
                 cause = (
-                    "two cells or devices: name the tower's own by 'cells: {STREAM: TOWER}', 'ingest --all' lists them"
+                    "a log that is listed twice, or two cells or devices: name the tower's own by "
+                    "'cells: {STREAM: TOWER}', 'ingest --all' lists them"
                 )
             raise UsageError(
                 f"{where} at the same time or with different properties: {path!r} and {later_path!r}",

@@ -182,7 +182,7 @@ class LinkSettings(StrictModel):
     """
 
     carrier_hz: CarrierHz
-    transmit_power_dbm: float = 40.0
+    transmit_power_dbm: Annotated[float, Field(ge=-200, le=100)] = 40.0
     uav_transmits: bool = True
     bandwidth_hz: Positive | None = None
     noise_figure_db: float | None = None
@@ -480,7 +480,7 @@ class RssSettings(StrictModel):
     """
 
     span_db: tuple[float, float] = (-50.0, 50.0)
-    lag: Literal["off", "estimate", "apply"] | float = "estimate"
+    lag: Literal["off", "estimate", "apply"] | Annotated[float, Field(ge=-86400, le=86400)] = "estimate"
     field: Literal["coherent", "power"] = "coherent"
     minimum_height_m: float | None = None
     advanced: AdvancedRss = AdvancedRss()

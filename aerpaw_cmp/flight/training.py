@@ -8,7 +8,7 @@ A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 - ``digits``: one digit every half second for the change of a level or a rank. It is the mean over 1 s minus the mean
   over 10 s, in steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
 - ``runs``: the smallest hashes of short runs of changes between readings, in steps of half a decibel (a bottom-k
-  sketch, Broder 1997), 8 hex digits each. Many remain after rounding to 0.1 dB. Another flight has others.
+  sketch, Broder 1997), 8 hex digits each. Many remain after rounding to 0.1 dB. Another flight has other ones.
 
 Two fingerprints belong to one log if they share runs, or if their clocks agree and their digits correlate at some lag.
 The digits of a log correlate with those of a part of it, and with those of a thinned, resampled, rounded or scaled

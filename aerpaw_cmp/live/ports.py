@@ -96,7 +96,7 @@ def _list_ports() -> list[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """The folder of devices and the list of serial ports. Tests use others."""
+    """The folder of devices and the list of serial ports. Tests use simulated ones."""
 
     dev: Path = Path("/dev")
     ports: Callable[[], list[Any]] = _list_ports

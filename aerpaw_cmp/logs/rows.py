@@ -237,7 +237,7 @@ class OtherLines:
     Parameters
     ----------
     reason : callable
-        Return why a line is rejected, or None for a header, a comment or other console output. As default, no line is
+        Return why a line is rejected, or None for a header, a comment or other console output. By default, no line is
         rejected.
     rejected : iterable of RejectedLine
         Lines that were rejected before.

@@ -69,13 +69,6 @@ class Grid:
     north_m: FloatArray
     spacing_m: float
 
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.spacing_m) and self.spacing_m > 0):
-            raise ValueError(f"grid spacing is {self.spacing_m} m; expected a positive length")
-        for name, axis in (("east_m", self.east_m), ("north_m", self.north_m)):
-            if axis.ndim != 1 or len(axis) == 0 or not np.allclose(np.diff(axis), self.spacing_m, rtol=1e-9):
-                raise ValueError(f"{name} is not an ascending axis with a step of {self.spacing_m} m")
-
     @classmethod
     def over_area(cls, area_m: tuple[float, float, float, float], spacing_m: float = PAPER_SPACING_M) -> Grid:
         """Return cells of ``spacing_m`` centred in ``(east_min, east_max, north_min, north_max)``, without a remainder.

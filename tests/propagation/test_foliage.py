@@ -14,7 +14,6 @@ from aerpaw_cmp.propagation.field.foliage import (
     P833,
     P833_TABLE,
     CrownIndex,
-    NoFoliage,
     Opaque,
     crown_index,
     foliage_depth_m,
@@ -115,13 +114,12 @@ def test_p833_table_is_met_and_continued_smoothly() -> None:
     assert P833.at(3.4e9).gamma_db_per_m == pytest.approx(1.2 * P833.at(3.4e9, in_leaf=False).gamma_db_per_m)
 
 
-def test_opaque_blocks_by_crown_and_trunk_and_none_does_not() -> None:
+def test_opaque_blocks_by_crown_and_trunk() -> None:
     stand = trees((0, 0, 0, 20, 10, 5))
     source = np.array([[-50.0, 0, 12], [-50, 0, 2], [-50, 3, 2]])
     target = source * [-1, 1, 1]
     args = (source, np.zeros((3, 0, 3)), target, stand)
     assert foliage_loss_db(*args, Opaque()).tolist() == [np.inf, np.inf, 0.0]  # crown, trunk, next to the trunk
-    assert foliage_loss_db(*args, NoFoliage()).tolist() == [0, 0, 0]
     attenuated = foliage_loss_db(*args, P833(0.5, 38.0))
     chord = 2 * 5 * (20 - 12) / 15
     np.testing.assert_allclose(attenuated, [38 * (1 - math.exp(-0.5 * chord / 38)), 0, 0])
@@ -130,9 +128,6 @@ def test_opaque_blocks_by_crown_and_trunk_and_none_does_not() -> None:
 def test_models_by_name() -> None:
     assert foliage_model("attenuating", 3.4e9, gamma_db_per_m=0.6, maximum_db=30) == P833(0.6, 30)
     assert foliage_model("attenuating", 3.4e9, in_leaf=False) == P833.at(3.4e9, in_leaf=False)
-    assert foliage_model("none", 3.4e9) == NoFoliage()
-    with pytest.raises(UsageError, match="expected none, opaque or attenuating"):
-        foliage_model("opake", 3.4e9)
     # the model comparison of a report replays opaque trees with the settings of the flight file
     assert foliage_model("opaque", 3.4e9, gamma_db_per_m=1, maximum_db=30) == Opaque()
     with pytest.raises(UsageError, match="gamma is -1"):

@@ -23,7 +23,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -47,23 +47,6 @@ _PAIRS_AT_ONCE = 1_500_000  # pairs of a piece and a body; about 150 MB of tempo
 
 
 # ---------------------------------------------------------------- models: depth in foliage to loss
-
-
-class FoliageModel(Protocol):
-    """A model that converts depth in foliage (...) [m] into loss (...) [dB]."""
-
-    def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Return the loss [dB], which is 0 at depth 0."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class NoFoliage:
-    """A model without trees."""
-
-    def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Return zero."""
-        return np.zeros_like(np.asarray(depth_m, dtype=np.float64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +124,10 @@ class P833:
         return np.asarray(-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db))
 
 
+# A model that converts depth in foliage (...) [m] into loss (...) [dB], which is 0 at depth 0.
+FoliageModel = Opaque | P833
+
+
 def foliage_model(
     name: str,
     frequency_hz: float,
@@ -149,38 +136,29 @@ def foliage_model(
     gamma_db_per_m: float | None = None,
     maximum_db: float | None = None,
 ) -> FoliageModel:
-    """Return a model by its name in flight.yaml: ``none``, ``opaque`` or ``attenuating``.
+    """Return a model by its name in flight.yaml.
 
     Parameters
     ----------
-    name : str
+    name : {"opaque", "attenuating"}
     frequency_hz : float
     in_leaf : bool
         Whether the trees are in leaf.
     gamma_db_per_m, maximum_db : float, optional
-        Specific attenuation [dB/m] and largest loss [dB] instead of P.833's table. The models ``none`` and ``opaque``
-        do not use them.
+        Specific attenuation [dB/m] and largest loss [dB] instead of P.833's table. The model ``opaque`` does not use
+        them.
 
     Returns
     -------
     FoliageModel
-
-    Raises
-    ------
-    UsageError
-        If the name is unknown.
     """
-    if name == "attenuating":
-        table = P833.at(frequency_hz, in_leaf=in_leaf)
-        return P833(
-            table.gamma_db_per_m if gamma_db_per_m is None else gamma_db_per_m,
-            table.maximum_db if maximum_db is None else maximum_db,
-        )
     if name == "opaque":
         return Opaque()
-    if name == "none":
-        return NoFoliage()
-    raise UsageError(f"unknown foliage model '{name}'", expected="none, opaque or attenuating")
+    table = P833.at(frequency_hz, in_leaf=in_leaf)
+    return P833(
+        table.gamma_db_per_m if gamma_db_per_m is None else gamma_db_per_m,
+        table.maximum_db if maximum_db is None else maximum_db,
+    )
 
 
 # ---------------------------------------------------------------- paths through trees
@@ -211,8 +189,6 @@ def foliage_loss_db(
     ndarray, (paths,)
         The model's loss of the path's total depth; NaN where an end is not finite.
     """
-    if isinstance(model, NoFoliage):
-        return np.zeros(len(source_m))
     index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = foliage_depth_m(source_m, vertices_m, target_m, index)
     if isinstance(model, Opaque):
@@ -512,8 +488,6 @@ def stand_loss_db(
         [dB]
     """
     loss = np.zeros(len(source_m))
-    if isinstance(model, NoFoliage):
-        return loss
     for start, end in legs(source_m, vertices_m, target_m):
         for crossing in _crossings(site, start, end):
             loss[crossing.segment] += _loss_db(crossing, model, in_leaf or model, wavelength_m)

@@ -20,6 +20,7 @@ from ..common.units import BoolArray, FloatArray, IntArray, spread_out
 from ..compare import level as rss
 from ..compare import offset as offsets
 from ..compare import rank as ranks
+from ..compare import result as records
 from ..compare import statistics
 from ..compare.gains import LostLock, StatedSpread, inside_shares
 from ..compare.ladder import log_distance_level_db
@@ -33,17 +34,6 @@ from ..compare.level import (
     score_detection,
 )
 from ..compare.receiver import ForecastScore, score_forecast
-from ..compare.result import (
-    APPLIED,
-    FlightResult,
-    ModelLevel,
-    PairResult,
-    RankFurther,
-    RankResult,
-    RssFurther,
-    RssResult,
-    SnrScore,
-)
 from ..compare.statistics import Visit, memory_share
 from ..compare.verdict import flight_verdict, with_corrected_verdicts
 from ..flight.data import FlightData, RankSeries, RssSeries
@@ -77,7 +67,7 @@ _DRAWS, _POSES = 6, 300
 _SHORTEST_S = 5.0
 
 
-def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
+def compare_flight(data: FlightData, replays: FlightReplay) -> records.FlightResult:
     """Compare every series with its replay, and every two channels of a tower with each other."""
     results = []
     for series, replayed in zip(data.rss, replays.rss, strict=True):
@@ -85,7 +75,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
         give_memory_back()  # a series of ten hours leaves 100 MiB fragmented, which the ranks need
     results = with_corrected_verdicts(results)
     cause, step = cause_of(data, replays, results)
-    return FlightResult(
+    return records.FlightResult(
         rss=tuple(results),
         verdict=flight_verdict(results),
         likely_cause=cause,
@@ -100,7 +90,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
 _SERVING_WITHIN_S = 1.5
 
 
-def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
+def serving_of(series: Sequence[RssSeries], results: Sequence[records.RssResult]) -> ServingComparison | None:
     """Compare logged serving cells with the strongest predicted cells, or return None if no log has a serving cell.
 
     The comparison has the cells that the flight file assigns to towers, at the times when one of them served. Levels
@@ -169,7 +159,7 @@ class _Case:
     trained: tuple[str, ...]
 
 
-def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> RssResult:
+def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> records.RssResult:
     """Return offset, RMSE, correlation, intervals and baselines of one tower and channel."""
     settings, case = data.settings.rss, _case(data, series, replayed)
     levels, clock = case.levels, replayed.clock
@@ -183,7 +173,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         span_db=settings.span_db,
     )
     if clock is not None:
-        also = ("lag_s",) if clock.result.applied == APPLIED else ()
+        also = ("lag_s",) if clock.result.applied == records.APPLIED else ()
         lag_s = clock.result.radio_minus_telemetry_s
         score = dataclasses.replace(score, lag_s=lag_s, fitted_on_scored=(*score.fitted_on_scored, *also))
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
@@ -191,7 +181,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     if case.trained:
         score, spans = rss.without_errors(score), []
     stated = _with_lock(case, score, stated_spread(replayed))
-    return RssResult(
+    return records.RssResult(
         tower=series.tower,
         channel=series.channel,
         unit=series.unit,
@@ -288,7 +278,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
     )
 
 
-def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> RssFurther:
+def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> records.RssFurther:
     """Return counts and conditions, and for a scored series further statistics of the error.
 
     Parameters
@@ -305,7 +295,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     settings, levels, series, replayed = case.data.settings.rss, case.levels, case.series, case.replayed
     wild = rss.outliers(levels.measured_db)
     detection = None if case.trained else _detection(case)
-    further = RssFurther(
+    further = records.RssFurther(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
         n_too_low=int((replayed.valid & ~levels.posed).sum()),
         n_no_pose=int((~replayed.valid).sum()),
@@ -397,9 +387,9 @@ def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, Fl
     }
 
 
-def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> dict[str, ModelLevel]:
+def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> dict[str, records.ModelLevel]:
     return {
-        name: ModelLevel(
+        name: records.ModelLevel(
             level_dbm=level,
             offset_db=score.baselines[name].offset_db,
             rmse_db=score.baselines[name].rmse_db,
@@ -433,7 +423,7 @@ def _averaged(case: _Case) -> dict[str, dict[str, offsets.OffsetFit]]:
     return out
 
 
-def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
+def _snr(series: RssSeries, levels: Levels) -> records.SnrScore | None:
     """Compare the replayed level above the receiver's noise with the logged ratio, without an offset."""
     if series.noise_dbm is None:
         return None
@@ -441,7 +431,7 @@ def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
     error_db = error_db[np.isfinite(error_db)]
     if not len(error_db):
         return None
-    return SnrScore(
+    return records.SnrScore(
         noise_dbm=series.noise_dbm,
         rmse_db=float(np.sqrt(np.mean(error_db**2))),
         mean_error_db=float(error_db.mean()),
@@ -474,7 +464,7 @@ def _detection(case: _Case) -> DetectionScore | None:
     return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
 
 
-def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
+def pairs_of(results: Sequence[records.RssResult]) -> list[records.PairResult]:
     """Compare every two channels of a tower at their common times."""
     out = []
     for channel, other_channel in combinations(results, 2):
@@ -489,7 +479,7 @@ def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
         if "heading_deg" in channel.geometry:
             context["heading_deg"] = channel.geometry["heading_deg"][rows]
         out.append(
-            PairResult(
+            records.PairResult(
                 tower=channel.tower,
                 first=channel.channel,
                 second=other_channel.channel,
@@ -577,7 +567,7 @@ def _worst(case: _Case, residual_db: FloatArray, line_of_sight: FloatArray) -> l
 # --- rank ----------------------------------------------------------------------------------------------------------
 
 
-def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> RankResult:
+def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> records.RankResult:
     """Compare measured with simulated rank for each K."""
     settings = data.settings.rank
     position = replayed.spread(replayed.poses.position_m)
@@ -599,7 +589,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     sigma, towers = ranks.singular_values(h), tower_places(replayed)
     probability, forecast, trained = _receiver_forecast(data, series)
     heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
-    return RankResult(
+    return records.RankResult(
         tower=series.tower,
         n_samples=len(series.rank),
         time=series.time[rows],
@@ -611,7 +601,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         level_dbm=replayed.replay.rss_dbm[poses, 0],
         rank={k: ranks.rank_from_singular_values(sigma, k) for k in score.simulated},
         score=score,
-        further=RankFurther(
+        further=records.RankFurther(
             n_flagged=dict(series.flagged),
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
             commonest=ranks.commonest_rank(series.rank[rows], position[rows]),

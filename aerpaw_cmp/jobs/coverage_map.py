@@ -17,19 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from ..common import units
 from ..common.cf import file_attributes, netcdf_bytes
 from ..common.errors import InputError, UsageError, about_file, noting_interrupts
 from ..common.outputs import file_digest
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
-from ..common.units import (
-    THERMAL_NOISE_DBM_HZ,
-    ComplexArray,
-    FloatArray,
-    carrier_fault,
-    db_from_power,
-    wavelength_m,
-)
 from ..compare.rank import singular_values
 from ..flight.gains import p833_note
 from ..maps import export
@@ -145,7 +138,7 @@ class MapSettings:
             raise UsageError(f"heights {heights}", expected="heights above ground [m], above 0")
         if not self.ks or any(not k > 1 for k in self.ks):
             raise UsageError(f"K {self.ks}", expected="ratios of singular values, above 1")
-        if fault := carrier_fault(self.carrier_hz):
+        if fault := units.carrier_fault(self.carrier_hz):
             raise UsageError(fault, cause="--carrier-ghz in megahertz or hertz")
         if self.tile_m is not None and not self.tile_m >= self.spacing_m > 0:
             raise UsageError(f"tiles of {self.tile_m:g} m", expected=f"at least the spacing, {self.spacing_m:g} m")
@@ -217,8 +210,8 @@ class SiteChannels:
     def __init__(self, site: Site, settings: MapSettings) -> None:
         self.settings, self.names = settings, tuple(site.towers)
         self.crowns = {mode: crown_index(site.under(mode).trees) for mode in settings.foliage}
-        power_dbm = settings.budget.tx_power_dbm + float(db_from_power(settings.elements))
-        reach_m = range_m(settings.carrier_hz, power_dbm, THERMAL_NOISE_DBM_HZ)
+        power_dbm = settings.budget.tx_power_dbm + float(units.db_from_power(settings.elements))
+        reach_m = range_m(settings.carrier_hz, power_dbm, units.THERMAL_NOISE_DBM_HZ)
         self.reach = Reach(site, reach_m, max_depth=settings.max_depth)
         self.paths = 0
         self._ready: dict[tuple[str, bytes], grids.Evaluation] = {}
@@ -227,7 +220,7 @@ class SiteChannels:
     def _take_site(self, site: Site) -> None:
         """Use the part of the site that reaches a tile."""
         self.site = site
-        apart_m = self.settings.element_spacing * wavelength_m(self.settings.carrier_hz)
+        apart_m = self.settings.element_spacing * units.wavelength_m(self.settings.carrier_hz)
         self.siso = self._link(single_element())
         self.mimo = self._link(linear_array(self.settings.elements, apart_m, 0.0))
         self.sources_m = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
@@ -239,7 +232,7 @@ class SiteChannels:
     def of(self, mode: str) -> grids.Evaluate:
         """Return the evaluation of one foliage mode."""
 
-        def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> grids.Evaluation:
+        def evaluate(position_m: units.FloatArray, towers: tuple[str, ...]) -> grids.Evaluation:
             if towers != self.names:
                 raise ValueError(f"towers {towers} are not those of the site")
             chunk = position_m.tobytes()
@@ -276,7 +269,7 @@ class SiteChannels:
         self._take_site(replace(self.reach.site, towers={}))
         return self._maps(grid)
 
-    def _all_modes(self, position_m: FloatArray) -> dict[str, grids.Evaluation]:
+    def _all_modes(self, position_m: units.FloatArray) -> dict[str, grids.Evaluation]:
         s, n = self.settings, len(position_m)
         if not self.site.towers:
             none = np.empty((n, 0))
@@ -305,7 +298,7 @@ class SiteChannels:
             return some
         at = [self.names.index(name) for name in self.site.towers]
 
-        def placed(values: FloatArray) -> FloatArray:
+        def placed(values: units.FloatArray) -> units.FloatArray:
             every = np.full((len(values), len(self.names), *values.shape[2:]), np.nan)
             every[:, at] = values
             return every
@@ -313,29 +306,29 @@ class SiteChannels:
         siso, mimo, spread = (placed(level) for level in some.levels)
         return grids.Evaluation(siso, mimo, spread, placed(some.singular_values))
 
-    def _rss_dbm(self, h: ComplexArray) -> FloatArray:
+    def _rss_dbm(self, h: units.ComplexArray) -> units.FloatArray:
         """Return the level for channels (..., n_rx, n_tx) with equal feeds in phase, mean over the UAV's elements."""
         amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
         return rss_dbm((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), self.settings.budget.tx_power_dbm)
 
-    def _above_ground(self, position_m: FloatArray) -> FloatArray:
+    def _above_ground(self, position_m: units.FloatArray) -> units.FloatArray:
         if self.site.dem is None:
             return position_m
         ground = self.site.dem.ground_m(position_m[:, 0], position_m[:, 1])
         return np.column_stack([position_m[:, :2], position_m[:, 2] + ground])
 
-    def _loss_db(self, mode: str, paths: PathSet, poses: Poses) -> FloatArray | None:
+    def _loss_db(self, mode: str, paths: PathSet, poses: Poses) -> units.FloatArray | None:
         if mode == "none" or not self.site.wooded:
             return None
         model = foliage_model(mode, self.settings.carrier_hz)
         source, target = self.sources_m[paths.tower], poses.position_m[paths.pose]
         trees_db = foliage_loss_db(source, paths.vertices_m, target, self.crowns[mode], model)
-        wavelength = wavelength_m(self.settings.carrier_hz)
+        wavelength = units.wavelength_m(self.settings.carrier_hz)
         return trees_db + stand_loss_db(self.site.under(mode), source, paths.vertices_m, target, model, wavelength)
 
     def _shaded(
-        self, clear: ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
-    ) -> ComplexArray:
+        self, clear: units.ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: units.FloatArray | None
+    ) -> units.ComplexArray:
         """Return channel matrices with foliage. Links without loss are not evaluated again."""
         if loss_db is None:
             return clear
@@ -370,10 +363,10 @@ def _channels_of(site: str, settings: MapSettings) -> SiteChannels:
     return SiteChannels(load_site(site), settings)
 
 
-def level_sd_db(h: ComplexArray) -> FloatArray:
+def level_sd_db(h: units.ComplexArray) -> units.FloatArray:
     """Return the standard deviation of the level over the element pairs of channels (..., n_rx, n_tx) [dB]."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(db_from_power(h.real**2 + h.imag**2).std(axis=(-2, -1)))
+        return np.asarray(units.db_from_power(h.real**2 + h.imag**2).std(axis=(-2, -1)))
 
 
 # --- the job -------------------------------------------------------------------------------------------------------

@@ -420,15 +420,10 @@ def is_own_radio(stream: Stream) -> bool:
     return stream.kind == "rss" and _text(stream, "quantity") == "telemetry radio RSSI"
 
 
-def rank_quantity(stream: Stream, reader: str) -> str:
-    """Return the name that a stream specifies for its rank, or else the name of its reader."""
-    return _text(stream, "source") or reader
-
-
 def quantity_of(data: FlightData, series: RankSeries) -> str:
-    """Return the name of a rank in its log, as :func:`rank_quantity` does."""
-    file = data.files[int(series.log[0])]
-    return next(rank_quantity(stream, file.result.reader) for stream in file.result.streams if stream.kind == "rank")
+    """Return the name that a log specifies for its rank, or else the name of its reader."""
+    result = data.files[int(series.log[0])].result
+    return next(_text(stream, "source") or result.reader for stream in result.streams if stream.kind == "rank")
 
 
 def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettings]:

@@ -19,23 +19,9 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.geodesy import azimuth_rad, elevation_rad
 from ..common.units import BoolArray, FloatArray, IntArray, spread_out, wrap_degrees
+from . import gains
 from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
-from .gains import (
-    GainFit,
-    GainModel,
-    GainOf,
-    LinkSamples,
-    MountFit,
-    Spread,
-    StatedSpread,
-    chosen_fit,
-    fading_of,
-    fit_gain,
-    fit_mounts,
-    inside_shares,
-    rotated,
-    turned,
-)
+from .gains import LinkSamples, turned
 from .ladder import log_distance_level_db
 from .level import crps_normal, floored_fit, local_mean_db
 from .result import BASELINE_TITLE
@@ -95,16 +81,16 @@ class Recipe:
         Gain of measured patterns in the device frame, for ``uav`` and antennas (``tower.channel``). It can be empty.
     """
 
-    model: GainModel
-    patterns: Mapping[str, GainOf] = field(default_factory=dict)
+    model: gains.GainModel
+    patterns: Mapping[str, gains.GainOf] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
     """The measured patterns by name, and the fitted mounts of the patterns that a flight used."""
 
-    patterns: Mapping[str, GainOf]
-    mounts: Mapping[str, MountFit]
+    patterns: Mapping[str, gains.GainOf]
+    mounts: Mapping[str, gains.MountFit]
 
     def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
         """Return the gain (n,) of a mounted pattern towards directions (n, 3) in the frame of body or mast.
@@ -132,21 +118,21 @@ class Learned(Mounted):
         Fading of the training flights by antenna, from :func:`~aerpaw_cmp.compare.gains.fading_of`.
     """
 
-    fit: GainFit
+    fit: gains.GainFit
     fading: Mapping[str, tuple[float, float]]
 
     @property
-    def model(self) -> GainModel:
+    def model(self) -> gains.GainModel:
         """The terms and strengths of the fit."""
         return self.fit.model
 
-    def spread(self, antenna: str) -> Spread:
+    def spread(self, antenna: str) -> gains.Spread:
         """Return the error model of a level at an antenna, excluding the standard deviation of the gain."""
         sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
         campaign = next((s.campaign for s in self.fit.rows if s.antenna == antenna), "")
         own_sd_db, noise_sd_db = self.model.scales_db(antenna, campaign)
         fading = {"fading_sd_db": sd_db, "fading_kurtosis": kurtosis}
-        return Spread(own_sd_db=own_sd_db, noise_sd_db=noise_sd_db, bin_s=self.model.bin_s, **fading)
+        return gains.Spread(own_sd_db=own_sd_db, noise_sd_db=noise_sd_db, bin_s=self.model.bin_s, **fading)
 
     def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Return the gain of both ends and its standard deviation (n,) [dB], up to a constant."""
@@ -167,7 +153,7 @@ class Learned(Mounted):
 _FINE_S = 0.5
 
 
-def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
+def _mean_along(fit: gains.GainFit, samples: LinkSamples) -> FloatArray:
     """Return the gain (n,) along a flight [dB], interpolated linearly between means over :data:`_FINE_S`."""
     at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(_FINE_S)
     if not len(at):
@@ -177,7 +163,7 @@ def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
     return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
 
 
-def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None = None) -> Learned:
+def learn(series: Sequence[LinkSamples], recipe: Recipe, model: gains.GainModel | None = None) -> Learned:
     """Fit the mounts of the patterns, then the gain over direction that remains.
 
     Parameters
@@ -190,17 +176,17 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
     """
     names = ["uav", *dict.fromkeys(s.antenna for s in series)]
     patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
-    mounted = Mounted(recipe.patterns, fit_mounts(series, patterns) if patterns else {})
+    mounted = Mounted(recipe.patterns, gains.fit_mounts(series, patterns) if patterns else {})
     residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
-    fit = chosen_fit(residuals, recipe.model) if model is None else fit_gain(residuals, model)
+    fit = gains.chosen_fit(residuals, recipe.model) if model is None else gains.fit_gain(residuals, model)
     if any(s.floor_db is not None for s in series):  # a third fit would not change held-out errors
-        fit = fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
+        fit = gains.fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
-    fading = {name: fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
+    fading = {name: gains.fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
     return Learned(recipe.patterns, mounted.mounts, fit, fading)
 
 
-def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
+def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: gains.GainFit) -> LinkSamples:
     """Subtract ``known_db`` from the residual, and replace samples below the floor.
 
     Samples below the floor get the value that the fit predicts, limited to the floor.
@@ -372,7 +358,7 @@ def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: fl
         if any(s.airframe == pupils[0].samples.airframe for s in train):
             fit = learn(train, recipe).fit
             for o in pupils:
-                at_uav = rotated(o.samples.at_uav, turn_deg)
+                at_uav = gains.rotated(o.samples.at_uav, turn_deg)
                 scores.append(score(o, fit.airframe_mean(dataclasses.replace(o.samples, at_uav=at_uav))))
     return tuple(s for s in scores if s is not None)
 
@@ -405,11 +391,11 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
             continue
         # spread over the flight, because neighbouring samples have nearly the same standard deviation
         some = spread_out(len(gain), _SPREAD_SAMPLES)
-        stated = StatedSpread(
+        stated = gains.StatedSpread(
             gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
         )
         error = o.samples.residual_db - gain - fitted.offset_db
-        fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
+        fitted = dataclasses.replace(fitted, **gains.inside_shares(error[some], stated))  # type: ignore[arg-type]
         # RMSE with another offset: mean square plus the squared difference of the offsets
         shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
         yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
@@ -668,7 +654,7 @@ class Correction:
         channel = self.channels.get(samples.antenna)
         if channel is None:
             raise InputError(f"no flight has {samples.antenna}", expected="one of " + ", ".join(self.channels))
-        gains, gain_sds = (np.stack(part) for part in zip(*map(self.predictor, each), strict=True))
+        means, gain_sds = (np.stack(part) for part in zip(*map(self.predictor, each), strict=True))
         targets = Rows.of(samples, self.flights.index(flight) if flight in self.flights else NEW_FLIGHT)
         if len(each) > 1:
             targets = dataclasses.replace(targets, direction=np.stack([s.at_uav for s in each], axis=1))
@@ -681,8 +667,8 @@ class Correction:
         if own_mean:
             # errors relative to a flight's own mean do not contain its offset
             _, sd = fit.predict(targets, ("place", "drift"))
-        variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
-        return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
+        variance = sd**2 + (gain_sds**2).mean(axis=0) + means.var(axis=0) + self.model.noise_sd_db**2
+        return means.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
 
 
 def between_blocks_db(channel: Channel) -> float:
@@ -782,11 +768,11 @@ def _score_fold(
         if keep:
             models[title] = model
         parts: tuple[Part, ...] = ("place", "drift") if new_flight else PARTS
-        for samples, gains in zip(binned, known, strict=True):
-            if gains is None:
+        for samples, predicted in zip(binned, known, strict=True):
+            if predicted is None:
                 tallies[title].append((np.full(len(samples), np.nan), np.ones(len(samples))))
                 continue
-            channel, (gain, gain_sd) = channels[samples.antenna], gains
+            channel, (gain, gain_sd) = channels[samples.antenna], predicted
             code = NEW_FLIGHT if new_flight else flights.index(samples.flight)
             mean, sd = FieldFit(model, channel.rows, channel.left_db).predict(Rows.of(samples, code), parts)
             error = samples.residual_db - gain - mean

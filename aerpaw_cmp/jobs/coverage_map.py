@@ -25,21 +25,9 @@ from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
 from ..compare.rank import singular_values
 from ..flight.gains import p833_note
+from ..maps import evaluate as interpolation
 from ..maps import export
 from ..maps import grid as grids
-from ..maps.evaluate import (
-    LOWEST_M,
-    TREATMENTS,
-    InverseDistance,
-    Predictor,
-    Score,
-    ServingTowerMean,
-    Study,
-    blocked,
-    interpolation_study,
-    paper_scores,
-    rank_fields,
-)
 from ..maps.export import maps_dataset
 from ..maps.grid import PAPER_BUDGET, Grid, Layer, LinkBudget, MapResult
 from ..maps.kriging import OrdinaryKriging, Sampling
@@ -388,9 +376,9 @@ class MapOutcome:
     site: Site
     settings: MapSettings
     maps: dict[str, MapResult] = field(default_factory=dict)
-    studies: dict[str, Study] = field(default_factory=dict)
-    draws: list[Mapping[str, Score]] = field(default_factory=list)
-    blocks: dict[str, Score] = field(default_factory=dict)
+    studies: dict[str, interpolation.Study] = field(default_factory=dict)
+    draws: list[Mapping[str, interpolation.Score]] = field(default_factory=list)
+    blocks: dict[str, interpolation.Score] = field(default_factory=dict)
     correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
     paths: int = 0
     tiles: dict[str, Any] = field(default_factory=dict)
@@ -532,10 +520,10 @@ def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[
 def check_study(place: Site, settings: MapSettings) -> None:
     """Refuse a study of fewer than two rank heights before any map is computed."""
     studied = settings.study and not settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m))
-    heights = [height for height in settings.rank_altitudes_m if height >= LOWEST_M]
+    heights = [height for height in settings.rank_altitudes_m if height >= interpolation.LOWEST_M]
     if studied and len(heights) < 2:
         raise UsageError(
-            f"{counted(len(heights), 'rank height')} at or above {LOWEST_M:g} m",
+            f"{counted(len(heights), 'rank height')} at or above {interpolation.LOWEST_M:g} m",
             expected="two or more for the study, or --no-study",
         )
 
@@ -543,15 +531,18 @@ def check_study(place: Site, settings: MapSettings) -> None:
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:
     """Compute correlation, interpolation and its errors on the maps of the paper's foliage mode."""
     s, result = outcome.settings, outcome.shown
-    rank = rank_fields(result)[1]
+    rank = interpolation.rank_fields(result)[1]
     local = Sampling(neighbours=s.neighbours, radius_m=s.reach_m, seed=s.seed)
     with stages("leave one out"):
-        zeros, towers = rank_fields(result, "zero")[1], result.towers_m
-        outcome.studies["missing"] = interpolation_study(result.grid, rank, towers, local)
-        outcome.studies["zero"] = interpolation_study(result.grid, zeros, towers, local)
+        zeros, towers = interpolation.rank_fields(result, "zero")[1], result.towers_m
+        outcome.studies["missing"] = interpolation.interpolation_study(result.grid, rank, towers, local)
+        outcome.studies["zero"] = interpolation.interpolation_study(result.grid, zeros, towers, local)
         draws = [replace(local, selection="random", seed=s.seed + draw) for draw in range(DRAWS)]
-        random = outcome.studies["random"] = interpolation_study(result.grid, zeros, towers, draws[0])
-        outcome.draws = [random.scores, *(paper_scores(result.grid, zeros, random.fit, draw) for draw in draws[1:])]
+        random = outcome.studies["random"] = interpolation.interpolation_study(result.grid, zeros, towers, draws[0])
+        outcome.draws = [
+            random.scores,
+            *(interpolation.paper_scores(result.grid, zeros, random.fit, draw) for draw in draws[1:]),
+        ]
     with stages("correlation"):
         points, width = result.grid.points_m, s.spacing_m
         outcome.correlations = {
@@ -560,17 +551,17 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
         }
     with stages("held-out tests"):
         for name, model in _far_reaching(outcome).items():
-            outcome.blocks[name] = blocked(model, result.grid.points_m, rank, s.block_m)
+            outcome.blocks[name] = interpolation.blocked(model, result.grid.points_m, rank, s.block_m)
 
 
-def _far_reaching(outcome: MapOutcome) -> dict[str, Predictor]:
+def _far_reaching(outcome: MapOutcome) -> dict[str, interpolation.Predictor]:
     """Return interpolators without a limit of distance, for held-out blocks."""
     neighbours = outcome.settings.neighbours
     return {
         "Kriging": OrdinaryKriging(outcome.studies["missing"].fit, neighbours, outside="nearest"),
-        "nearest": InverseDistance(neighbours=1, radius_m=np.inf),
-        "inverse distance": InverseDistance(neighbours=neighbours, radius_m=np.inf),
-        "serving-tower mean": ServingTowerMean(outcome.shown.towers_m),
+        "nearest": interpolation.InverseDistance(neighbours=1, radius_m=np.inf),
+        "inverse distance": interpolation.InverseDistance(neighbours=neighbours, radius_m=np.inf),
+        "serving-tower mean": interpolation.ServingTowerMean(outcome.shown.towers_m),
     }
 
 
@@ -714,17 +705,20 @@ def _further_layers(outcome: MapOutcome) -> Iterator[Layer]:
 def _correlations(outcome: MapOutcome) -> dict[str, tuple[BinnedCorrelation, BiExponential | None]]:
     """Return each correlation against distance, with its fitted curve if there is one, by title."""
     titles = {"horizontal": "Rank, one height", "RSS": "RSS, one height"}
-    studies = {key: outcome.studies[key] for key in TREATMENTS if key in outcome.studies}
-    fitted = {f"Rank vectors, {TREATMENTS[key]}": (study.correlation, study.fit) for key, study in studies.items()}
+    studies = {key: outcome.studies[key] for key in interpolation.TREATMENTS if key in outcome.studies}
+    fitted = {
+        f"Rank vectors, {interpolation.TREATMENTS[key]}": (study.correlation, study.fit)
+        for key, study in studies.items()
+    }
     return fitted | {titles[key]: (binned, None) for key, binned in outcome.correlations.items()}
 
 
 def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
     if not outcome.studies:
         return
-    heights, _ = rank_fields(outcome.shown)
-    chosen, zero = outcome.studies["random"].scores, TREATMENTS["zero"]
-    tables: dict[str, dict[str, Score]] = {
+    heights, _ = interpolation.rank_fields(outcome.shown)
+    chosen, zero = outcome.studies["random"].scores, interpolation.TREATMENTS["zero"]
+    tables: dict[str, dict[str, interpolation.Score]] = {
         "leave one out": dict(outcome.studies["missing"].scores),
         f"leave one out, {zero}": dict(outcome.studies["zero"].scores),
         f"leave one out, {zero}, random samples": {name: chosen[name] for name in INTERPOLATORS if name in chosen},

@@ -39,20 +39,10 @@ from ..report.plan import PlanPage, plan_metrics, write_plan
 from ..report.texts import safe_name
 from ..site.mapfiles import MAX_CROSSINGS, is_tangled
 from ..site.site import Site
+from . import sources
 from .calibrate import learned_antennas, observe
 from .options import DEFAULT, JobOutcome, RunOptions
 from .predict import site_of
-from .sources import (
-    NamedFlight,
-    TargetOptions,
-    Targets,
-    files_of,
-    find_targets,
-    level_samples,
-    named_flights,
-    sources_of,
-    target_files,
-)
 
 # Name of the target that contains all directions between tower and UAV, at all headings.
 _SPHERE = "sphere"
@@ -107,7 +97,7 @@ class PlanOptions:
     avoid: tuple[Path, ...] = ()
     routes: tuple[Path, ...] = ()
     towers: tuple[str, ...] = ()
-    target: TargetOptions = field(default_factory=lambda: TargetOptions(grid_spacing_m=60.0))
+    target: sources.TargetOptions = field(default_factory=lambda: sources.TargetOptions(grid_spacing_m=60.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +117,7 @@ class Candidate:
 
 
 def _plan_flight(
-    target: str, flights: Sequence[NamedFlight], plan: PlanOptions, logs_root: Path | None, stages: Stages
+    target: str, flights: Sequence[sources.NamedFlight], plan: PlanOptions, logs_root: Path | None, stages: Stages
 ) -> PlanPage:
     """Rank candidate flights by the standard deviation over a target after each flight.
 
@@ -155,13 +145,13 @@ def _plan_flight(
         datas, remarks = counted_once([flight.load(logs_root) for flight in flights])
         observed = observe(datas)[0] if datas else []
         site, _ = site_of(None if target == _SPHERE else Path(target), flights, datas, plan.target.site)
-        sources = sources_of(datas, observed) if datas else {}
-        ends = {a: (s.tower, s.channel) for a, s in sources.items()} or _open_ends(site, plan)
+        received = sources.sources_of(datas, observed) if datas else {}
+        ends = {a: (s.tower, s.channel) for a, s in received.items()} or _open_ends(site, plan)
         series = [o.samples for o in observed if o.samples.antenna in ends]
         area = _area(site, plan)
     with stages("candidates"):
         candidates = _candidates(plan, area, site)
-        points = None if target == _SPHERE else find_targets(Path(target), site, plan.target)
+        points = None if target == _SPHERE else sources.find_targets(Path(target), site, plan.target)
         if points is not None:
             remarks += points.remarks
             _check_near("target", shapely.multipoints(points.position_m[points.known]), area, "that may be flown")
@@ -299,7 +289,7 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """Return routes of files at the speed of the plan, each with the reason for a refusal."""
     out = []
     for path in plan.routes:
-        targets = find_targets(path, site, TargetOptions(heights_m=plan.heights_m))
+        targets = sources.find_targets(path, site, sources.TargetOptions(heights_m=plan.heights_m))
         if targets.kind == "grid" or targets.known.sum() < 2:
             raise InputError("not a route", expected="a .plan, KML, CSV or log with two points or more", path=path)
         place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
@@ -344,7 +334,7 @@ def _leaves_area(route: Route, area: Any) -> bool:
     return not bool(shapely.covers(shapely.buffer(area, _ALLOWED_OUTSIDE_M + 3.0), line))
 
 
-def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
+def _targets(points: sources.Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
     """Return target points per antenna (all directions if ``points`` is None), at all headings if none is given."""
     out = {}
     for antenna, end in ends.items():
@@ -362,7 +352,7 @@ def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, s
                 turns = np.arange(HEADINGS) * (360.0 / HEADINGS)
                 place = np.repeat(place, HEADINGS, axis=0)
                 yaw = np.where(np.isnan(yaw)[:, None], turns, yaw[:, None]).ravel()
-        out[antenna] = level_samples(end, tower, place, np.asarray(yaw, dtype=np.float64), np.zeros(len(yaw)))
+        out[antenna] = sources.level_samples(end, tower, place, np.asarray(yaw, dtype=np.float64), np.zeros(len(yaw)))
     return out
 
 
@@ -379,7 +369,9 @@ def _check_near(what: str, place: Any, area: Any, which: str) -> None:
 
 def _samples(route: Route, ends: Mapping[str, tuple[str, str]], site: Site) -> list[LinkSamples]:
     return [
-        level_samples(end, np.asarray(site.towers[end[0]].position_m), route.position_m, route.yaw_deg, route.time_s)
+        sources.level_samples(
+            end, np.asarray(site.towers[end[0]].position_m), route.position_m, route.yaw_deg, route.time_s
+        )
         for end in ends.values()
     ]
 
@@ -463,10 +455,10 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
     -------
     JobOutcome
     """
-    inputs = target_files(Path(target), plan.target.site, options.logs_root)
+    inputs = sources.target_files(Path(target), plan.target.site, options.logs_root)
     inputs += [path for path in (plan.fence, *plan.avoid, *plan.routes) if path is not None]
-    known = named_flights(flights)
-    inputs += files_of(known, options.logs_root)
+    known = sources.named_flights(flights)
+    inputs += sources.files_of(known, options.logs_root)
     folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
     stages = options.stages("plan", inputs, folder)
     with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:

@@ -19,23 +19,9 @@ import numpy as np
 
 from ...common.errors import InputError, UsageError
 from ...common.units import FloatArray, spread_out
+from ...compare import gains
 from ...compare.calibration import Observed
-from ...compare.gains import (
-    BODY,
-    LEAST_ODDS,
-    MAST,
-    PAIR,
-    Evidence,
-    FlightEvidence,
-    GainProcess,
-    LinkSamples,
-    Moments,
-    Spread,
-    Term,
-    judged,
-    link_directions,
-    rotated,
-)
+from ...compare.gains import LinkSamples
 from ...compare.locate import (
     FEWEST,
     Case,
@@ -165,7 +151,7 @@ class LearnedTower:
     tower: MeasuredPattern
     uav: MeasuredPattern
     model: LevelModel
-    moments: Moments | None = None
+    moments: gains.Moments | None = None
 
 
 @dataclass(frozen=True)
@@ -249,8 +235,10 @@ class NodeFinder:
         for i, tower in enumerate(towers):
             if estimate is None:
                 continue
-            if gains := [each for each in antennas.get(tower.name, ()) if self._supports(track, tower.name, each)]:
-                learned_odds = max(self._learned_odds(track, tower.name, each) for each in gains) - np.log(len(gains))
+            if fitting := [each for each in antennas.get(tower.name, ()) if self._supports(track, tower.name, each)]:
+                learned_odds = max(self._learned_odds(track, tower.name, each) for each in fitting) - np.log(
+                    len(fitting)
+                )
                 # odds against any position, as those of the search
                 learned_odds -= estimate.anywhere + _LEARNED_MORE
                 known[i] = learned_odds if learned_odds >= _TOWER_ODDS else -np.inf
@@ -294,25 +282,25 @@ class NodeFinder:
         at_estimate = round(float(latitude[0]), 7), round(float(longitude[0]), 7), float(place[2])
         return replace(_node(place, at_estimate, about, nodes), radius_m=estimate.radius90_m)
 
-    def _supports(self, track: LevelTrack, tower: str, gains: LearnedTower) -> bool:
+    def _supports(self, track: LevelTrack, tower: str, known: LearnedTower) -> bool:
         """Check whether levels support the learned antennas of a tower against an unknown gain."""
-        if gains.moments is None or track.rotation is None:
+        if known.moments is None or track.rotation is None:
             return True
         place = self.site.towers[tower].position_m
-        at_uav, at_tower = link_directions(place, track.position_m, track.rotation)
+        at_uav, at_tower = gains.link_directions(place, track.position_m, track.rotation)
         free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
         level = np.where(track.below, np.nan, track.level_db)
         samples = LinkSamples(
             flight="", tower=tower, channel="", time_s=track.time_s, position_m=track.position_m,
             at_uav=at_uav, at_tower=at_tower, residual_db=level - free,
         )  # fmt: skip
-        odds = FlightEvidence([samples]).of_link(0, gains.moments)
+        odds = gains.FlightEvidence([samples]).of_link(0, known.moments)
         return odds.fits
 
-    def _learned_odds(self, track: LevelTrack, tower: str, gains: LearnedTower) -> float:
+    def _learned_odds(self, track: LevelTrack, tower: str, ends: LearnedTower) -> float:
         """Return the log evidence of a tower with learned antennas at both ends."""
-        known = replace(track, airframe_db=_gain_of(gains.uav, gains.tower))
-        return float(fit_places(known, self.site.towers[tower].position_m[None, :], gains.model).evidence[0])
+        known = replace(track, airframe_db=_gain_of(ends.uav, ends.tower))
+        return float(fit_places(known, self.site.towers[tower].position_m[None, :], ends.model).evidence[0])
 
     def evidence(self, stream: Stream) -> float:
         """Return the log evidence per bin of levels along this track at the best tower, or -inf for too few levels."""
@@ -427,7 +415,7 @@ class LearnedLink:
         return self.series.level
 
     @property
-    def spread(self) -> Spread:
+    def spread(self) -> gains.Spread:
         """The error model of a level, without the standard deviation of the gains."""
         return spread_of(self.series.spread)
 
@@ -437,14 +425,14 @@ class LearnedLink:
         return self.tower.largest_sd_db**2 + self.uav.largest_sd_db**2
 
     @cached_property
-    def airframe(self) -> GainProcess:
+    def airframe(self) -> gains.GainProcess:
         """The gain of the UAV with its covariance."""
-        return _process(self.uav, self.known, BODY)
+        return _process(self.uav, self.known, gains.BODY)
 
     @cached_property
-    def tower_antenna(self) -> GainProcess:
+    def tower_antenna(self) -> gains.GainProcess:
         """The gain of the tower's antenna with its covariance."""
-        return _process(self.tower, self.tower_known, MAST)
+        return _process(self.tower, self.tower_known, gains.MAST)
 
     @property
     def airframe_is_general(self) -> bool:
@@ -473,8 +461,8 @@ class LearnedLink:
         return uav_db + tower_db + pair_db, covariance + of_tower
 
 
-def _process(pattern: SpherePattern, known: DirectionCovariance, term: Term) -> GainProcess:
-    return GainProcess(
+def _process(pattern: SpherePattern, known: DirectionCovariance, term: gains.Term) -> gains.GainProcess:
+    return gains.GainProcess(
         gain_db=lambda at: pattern.gain_dbi(*sphere_angles(at)),
         sd_db=lambda at: pattern.gain_sd_db(*sphere_angles(at)),
         directions=known.directions,
@@ -610,7 +598,7 @@ def propose(
         # a ratio to the noise is used only if there is no level
         levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
         observed, known = [observed_series(data, series)[0] for series in levels], all_learned_links(place)
-        evidence = FlightEvidence([o.samples for o in observed])
+        evidence = gains.FlightEvidence([o.samples for o in observed])
         bands = (learned.BAND, learned.AIRFRAME_BAND) if carrier_known else (math.inf, math.inf)
         chosen = _antennas_for(data, levels, known, evidence, nodes, bands)
         if chosen.fits:
@@ -630,15 +618,15 @@ class _Chosen:
     """The learned antennas of both ends of one entry that the levels support best, by ``tower.channel``."""
 
     antennas: Mapping[str, LearnedLink]
-    odds: Evidence
+    odds: gains.Evidence
 
     @property
     def fits(self) -> bool:
         """True if the antennas can be proposed."""
-        enough = self.odds.over_own >= LEAST_ODDS and self.odds.over_turned > -_MOUNTED_AS_LEARNED
+        enough = self.odds.over_own >= gains.LEAST_ODDS and self.odds.over_turned > -_MOUNTED_AS_LEARNED
         return bool(self.antennas) and enough
 
-    def proposal(self, site: str, evidence: FlightEvidence) -> Proposal:
+    def proposal(self, site: str, evidence: gains.FlightEvidence) -> Proposal:
         """Return the names of the antennas, with the expected error and the odds."""
         first, samples = next(iter(self.antennas.values())), evidence.rows[0]
         errors, kind = _expected(first.entry, first.series, samples.position_m, first.gain_db(samples)[1])
@@ -654,14 +642,14 @@ def _antennas_for(
     data: FlightData,
     levels: Sequence[RssSeries],
     known: Sequence[LearnedLink],
-    evidence: FlightEvidence,
+    evidence: gains.FlightEvidence,
     nodes: Nodes,
     bands: tuple[float, float],
 ) -> _Chosen:
     """Return the antennas of both ends of the entry with the largest odds."""
     receivers = {item.receiver for item in known}
     general = {item.series.uav_file: item for item in known if item.airframe_is_general}.values()
-    tried: dict[str, list[tuple[str, LearnedLink, Evidence]]] = {}
+    tried: dict[str, list[tuple[str, LearnedLink, gains.Evidence]]] = {}
     for number, series in enumerate(levels):
         # the same alternatives for all antennas, because their odds are compared with each other
         alone = (evidence.with_airframe(number, a.airframe) for a in general if _in_band(a, series, bands[1]))
@@ -685,16 +673,18 @@ def _antennas_for(
     over = [(odds.over_own, odds.over_turned) for _, odds in chosen.values()]
     own, turned = (sum(each) for each in zip(*over, strict=True)) if over else (0.0, 0.0)
     antennas = {key: item for key, (item, _) in chosen.items()}
-    return _Chosen(antennas=antennas, odds=Evidence(over_own=own, over_turned=turned))
+    return _Chosen(antennas=antennas, odds=gains.Evidence(over_own=own, over_turned=turned))
 
 
-def _one_each(tried: Sequence[tuple[str, LearnedLink, Evidence]]) -> dict[str, tuple[LearnedLink, Evidence]]:
+def _one_each(
+    tried: Sequence[tuple[str, LearnedLink, gains.Evidence]],
+) -> dict[str, tuple[LearnedLink, gains.Evidence]]:
     """Return the antennas of each channel, those with the largest odds first.
 
     Two channels of a tower have two antennas, so an antenna is used twice only if there are too few.
     """
     pairs = sorted(tried, key=lambda pair: -pair[2].over_own)
-    chosen: dict[str, tuple[LearnedLink, Evidence]] = {}
+    chosen: dict[str, tuple[LearnedLink, gains.Evidence]] = {}
     for key, item, odds in pairs:
         if all(item is not other for other, _ in chosen.values()):
             chosen.setdefault(key, (item, odds))
@@ -705,7 +695,7 @@ def _one_each(tried: Sequence[tuple[str, LearnedLink, Evidence]]) -> dict[str, t
 
 # Standard deviation of the level of an unknown receiver [dB], and of the gains of both ends if they are not known.
 _UNKNOWN_LEVEL_DB = 30.0
-_UNKNOWN_GAINS_DB = math.hypot(BODY.sd_db, MAST.sd_db, PAIR.sd_db)
+_UNKNOWN_GAINS_DB = math.hypot(gains.BODY.sd_db, gains.MAST.sd_db, gains.PAIR.sd_db)
 
 # Log odds of the receiver of learned antennas that the levels support, and of one that loses its lock as the log does.
 _ITS_ANTENNAS = _ITS_LOCK = 5.0
@@ -741,7 +731,7 @@ def _receivers(
         best = max(together, key=lambda name: together[name], default="")
         rivals = [nat for name, nat in together.items() if name != best]
         over = together.get(best, -math.inf) - float(np.logaddexp.reduce([0.0, *rivals]))
-        if over >= LEAST_ODDS:
+        if over >= gains.LEAST_ODDS:
             out[log] = Receiver(best, f"{words[log, best]}, odds {_ratio(over)}: is it the learned receiver {best}?")
         elif chosen.fits and (log, theirs) in words:
             out[log] = Receiver("", f"{words[log, theirs]}: is it another receiver than {theirs}?")
@@ -774,11 +764,11 @@ def _receiver_odds(
 
 
 def _airframe_for(
-    data: FlightData, known: Sequence[LearnedLink], site: str, evidence: FlightEvidence, *, band: float
+    data: FlightData, known: Sequence[LearnedLink], site: str, evidence: gains.FlightEvidence, *, band: float
 ) -> Proposal:
     """Return the airframe alone that the levels support, or a proposal with the odds of the best airframe only."""
     own, marks = set(flight_logs(data)), marks_of([data])
-    tried: dict[str, tuple[LearnedLink, Evidence]] = {}
+    tried: dict[str, tuple[LearnedLink, gains.Evidence]] = {}
     for item in known:
         same_log = own & set(item.entry.trained_on) or any(among(mark, item.uav.marks) for mark in marks)
         near = all(_in_band(item, series, band) for series in data.rss)
@@ -831,7 +821,7 @@ def _in_band(item: LearnedLink, series: RssSeries, band: float) -> bool:
 _MOST_ODDS = 1000.0
 
 
-def _odds(odds: Evidence) -> str:
+def _odds(odds: gains.Evidence) -> str:
     """Return the odds of antennas as words.
 
     Examples
@@ -907,13 +897,13 @@ def searching_airframe(
         levels, cases = track, _SCATTERS
         if airframe is not None:
             gain, cases = _gain_of(airframe, None), tuple(replace(c.with_airframe(), log_weight=0.0) for c in cases)
-            levels = replace(track, airframe_db=lambda at_uav, node: gain(rotated(at_uav, turn_deg), node))
+            levels = replace(track, airframe_db=lambda at_uav, node: gain(gains.rotated(at_uav, turn_deg), node))
         evidence = fit_places(levels, places, LevelModel(cases=cases)).evidence
         return float(evidence.max() + np.log(np.exp(evidence - evidence.max()).mean()))
 
     best = max(known.values(), key=likelihood)
     # only the best airframe is compared with its copies, because they take most of the time
-    return best if judged(likelihood(None), lambda turn_deg: likelihood(best, turn_deg)).fits else None
+    return best if gains.judged(likelihood(None), lambda turn_deg: likelihood(best, turn_deg)).fits else None
 
 
 def _likely_places(track: LevelTrack) -> FloatArray:

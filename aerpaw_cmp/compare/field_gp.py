@@ -374,7 +374,7 @@ class FlownFlights:
     Parameters
     ----------
     series : sequence of LinkSamples
-        Samples of the flown flights. Without any, the gains of the antennas have their prior uncertainty.
+        Samples of the flown flights. If there are none, gains have their prior uncertainty.
     model : GainModel
         Gain model: terms and strengths of the antennas, error of a flight and channel, and noise.
     field : FieldModel, optional

@@ -214,7 +214,7 @@ def error_at_offset(
 
     Notes
     -----
-    RMSE^2(o) = variance + (o - mean)^2, with the variance from the known point.
+    RMSE^2(o) = variance + (o - mean)^2. The variance follows from the known RMSE at the known offset.
 
     Examples
     --------

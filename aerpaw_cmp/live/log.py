@@ -287,7 +287,7 @@ class TapLog:
         self._dirty = True
 
     def _fail(self, error: OSError) -> None:
-        """Begin a fault of the disk, or wait for the next attempt."""
+        """Record that the disk failed, and set the time of the next attempt."""
         if error.errno in (errno.EIO, errno.EROFS, errno.EBADF, errno.ESTALE):
             self._close_fd()  # after a failed sync the kernel may have dropped pages: go on in a new segment
         self._retry_ns = self._clock.mono_ns() + int(self._settings.retry_s * 1e9)

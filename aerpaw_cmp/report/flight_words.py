@@ -676,10 +676,10 @@ def _rank(panel: RankResult) -> Headline | None:
         return None
     at, commonest = panel.score.simulated[k], panel.further.commonest
     low, high = at.total_variation_ci95
-    ends = f" (95 %: {low:.2f} to {high:.2f})" if math.isfinite(low) and math.isfinite(high) else ""
+    ends = f", 95 %: {low:.2f} to {high:.2f}" if math.isfinite(low) and math.isfinite(high) else ""
     agree = f"agreement {100 * at.agreement:.0f} %" if math.isfinite(at.agreement) else "no pose in common"
     guess = f"; always guessing {commonest.rank}: {100 * commonest.agreement:.0f} %" if commonest.rank else ""
     return Headline(
         label=f"Rank at {panel.tower}, K = {k:.10g}", value=f"{at.total_variation:.2f}",
-        interval=f"total variation of the shares, from 0 to 1{ends}", reference=f"{agree}{guess}",
+        interval=f"total variation (0 to 1){ends}", reference=f"{agree}{guess}",
     )  # fmt: skip

@@ -366,7 +366,7 @@ def test_sentence_and_card_of_a_rank_show_the_same_digits(report_data):
     best = min(data.rank[0].score.simulated.values(), key=lambda at: at.total_variation)
     assert f"shares is {best.total_variation:.2f} (0: equal, 1: disjoint)" in sentence
     assert card.value == f"{best.total_variation:.2f}"
-    assert card.interval.startswith("total variation of the shares, from 0 to 1 (95 %: 0.")
+    assert card.interval.startswith("total variation (0 to 1), 95 %: 0.")
 
 
 @pytest.mark.parametrize("verdicts", [

@@ -532,7 +532,8 @@ def described(
     present = [bare for _, bare in own]
     known = known or program([*present, *map(plain, of)])
     words, columns = dict(known.words) if known else {}, []
-    if "rank" in present and not words and any((m := meaning(name)) and m.quantity.role == "rss" for name in present):
+    angles = any(re.match(r"az|alt", bare) for bare in present)
+    if "rank" in present and not words and any((m := meaning(name)) and m.quantity.kind != "kpi" for name in present):
         words = {"rank": "rank indicator"}  # without levels, 'rank' may be the position in a list
     for name, bare in own:
         forms = (re.sub(form, word, bare) for form, word in words.items() if re.fullmatch(form, bare))
@@ -542,6 +543,8 @@ def described(
         what = meaning(name, None if common == bare else common)
         if what is not None and what.quantity.name == "quality" and common == bare:
             what = None  # only AERPAW's sounder has a quality in dB, other link qualities are percentages
+        if bare.startswith("elev") and (angles or "deg" in bare):
+            what = None  # an angle next to an azimuth, or the ground next to an altitude
         unit = what.unit if what else without_unit(name)[1]
         if known and (not unit or bare in known.units):
             unit = known.units.get(bare, known.angles if what and what.quantity.role == "angle" else "")

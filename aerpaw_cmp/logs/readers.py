@@ -265,11 +265,9 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
             cause="name one with 'reader:' in flight.yaml or --reader",
             path=path,
         )
-    binary = b"\0" in head
+    binary, shown = b"\0" in head, ascii(head.lstrip().split(b"\n", 1)[0][:80].decode(errors="replace"))
     raise InputError(
-        "binary content that no reader recognises"
-        if binary
-        else f"no reader recognises this content: {_excerpt(head)}",
+        "binary content that no reader recognises" if binary else f"no reader recognises this content: {shown}",
         expected="one of the formats of 'aerpaw-cmp formats'",
         cause="another kind of file, or a damaged one" if binary else _way_out(head),
         path=path,
@@ -326,11 +324,6 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
     pairs = [f"--map {named[0]!r}={what}" for what, named in fits.items() if named]
     others = f" (or {', '.join(map(repr, fits['rss_db'][1:4]))})" if fits["rss_db"][1:] else ""
     return f"a table of another kind: name its columns: {' '.join(pairs)}{others}"
-
-
-def _excerpt(head: bytes) -> str:
-    line = head.lstrip().split(b"\n", 1)[0][:80]
-    return ascii(line.decode("utf-8", errors="replace"))
 
 
 def stated(result: ReadResult, reader: Reader, options: ReadOptions) -> ReadResult:

@@ -302,6 +302,7 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
     about: Height = {"height_from": rows.height_from, "height_datum": datum}
     possible = (altitude > _POSSIBLE_M[0]) & (altitude < _POSSIBLE_M[1])
     known = np.flatnonzero(possible & ~lost & ~astray(rows, values))
+    known = known[np.argsort(rows.time[known], kind="stable")]  # an export may begin with the newest row
     seconds = np.maximum(np.diff(rows.time[known]) / np.timedelta64(1, "s"), 0.1)
     rate_mps = np.abs(np.diff(altitude[known])) / seconds
     if 2 * (rate_mps > _FASTEST_MPS).sum() > (rate_mps > 0).sum():
@@ -326,7 +327,7 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
         )
         return altitude, about
     how = "the altitude at rest on the ground" if climbs else "that of the first position"
-    if not climbs and (before := int((~lost[: known[0]]).sum())):
+    if not climbs and (before := int((~lost & (rows.time < rows.time[known[0]])).sum())):
         how += f" with a height, after {counted(before, 'position')} without: was it on the ground there?"
     zero = "the ellipsoid" if datum == "ellipsoid" else "sea level"
     rows.warnings.append(f"altitudes are above {zero}: {first:.1f} m, {how}, was subtracted")

@@ -56,7 +56,7 @@ def split_row(line: bytes, separator: str) -> list[str]:
     return fields if len(fields) > 1 else text.strip('"').split(separator)
 
 
-def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, list[str]] | None:
+def header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, list[str]] | None:
     """Return the index, separator and names of the first line that is a header."""
     for i, line in enumerate(lines[:TITLES]):
         # a longer line is not a header
@@ -93,7 +93,7 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
         entries = [] if _OF_PROGRAMS.search(head) else _json.beginning(head)
         return bool(entries) and is_header([*{name: "" for entry in entries for name in _json.readings(entry)[0]}])
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
-    header = _header_of(lines, is_header)
+    header = header_of(lines, is_header)
     if header is None:
         return False
     at, separator, names = header
@@ -154,7 +154,7 @@ _HEMISPHERE = re.compile(r"[^A-Za-z]([NSEW])[\])]?\s*$")
 _OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", re.IGNORECASE)
 # The radio access of a cell as programs write it.
 _RAT = re.compile(r"(?i)(lte|nr|[2345]g|gsm|umts|wcdma|e-?utran?)([ _-]?(a|nr|nsa|sa|lte|fdd|tdd|e-?utran?))?")
-_ANY_RAT = re.compile(r"(?i)lte|nr|\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|neigh|serv|detect|^\s*$")
+_ANY_RAT = re.compile(r"(?i)lte|nr|^\s*\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|neigh|serv|detect|^\s*$")
 # Names of cells and satellites in columns that usually contain a state or a count.
 _A_CELL = re.compile(r"(?i)(?!\s*([01](\.0)?|[ps]?cell ?\d*)\s*$).*\d")
 _NAMES_IN = {"serving": _A_CELL, "neighbouring": _A_CELL, "satellites": re.compile(r"\s*[^\W\d_]\w*[- ]?\d")}
@@ -366,8 +366,8 @@ class Sheet:
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
         told = {text: count for text, count in counts.items() if text.lower() not in NO_VALUE}
         words = {text: count for text, count in told.items() if math.isnan(parsed[text][0])}
-        of_level = meaning is not None and meaning.quantity.role == "rss"
-        if meaning is not None and 2 * sum(words.values()) > (0 if of_level else sum(told.values())):
+        role = "" if meaning is None else meaning.quantity.role
+        if role not in ("", "time") and 2 * sum(words.values()) > (0 if role == "rss" else sum(told.values())):
             self.notes[column] = (
                 f"column {self.names[column]!r}: {counted(sum(words.values()), 'cell')} without a number (the first: "
                 f"{next(iter(words))[:30]!r}) are read as missing"
@@ -447,6 +447,8 @@ class Sheet:
         if gains:
             text = "changes, and levels are not corrected for it: do they already include it?"
             said.append(f"column {self.names[gains[0]]!r} {text}")
+        above = [self.lines.text(i) for i in range(min(int(self.row[0]), TITLES) if len(self) else 0)]
+        said += [f"above the table, but not read: {text.strip()[:80]!r}" for text in above if _UNITS_ABOVE.match(text)]
         equal = len(self) - len({*map(tuple, self.cells)})
         if equal > _MOST_EQUAL * len(self):
             said.append(f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?")
@@ -482,17 +484,21 @@ class Sheet:
             return all(_LETTER.search(text) and math.isnan(_number(text)[0]) for text in texts)
         # unlike waypoints and heights, numbers of cells are neither consecutive nor round; unlike counts, they are few
         numbers = np.unique([int(text) for text in texts])
-        few = np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any() and len(numbers) <= _MOST_NUMBERS
+        like = np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any()
+        few = (like or _CALLED.search(self.plain[column])) and len(numbers) <= min(_MOST_NUMBERS, len(self) / 3)
         levels = any((what := self.meanings[i]) and what.quantity.role == "rss" for i in self.used)
         return bool(few and levels and self.find("PCI") is None)
 
 
+_CALLED = re.compile(r"\b(id|unit|cc|chain|scell|no|num(ber)?)\b")
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
 _ASU = re.compile(r"\basu\b")
 # Gains of a receiver, not those of an antenna or a transmitter.
 _GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(uation|uator)?)\b")
 # Largest share of rows that are equal to another row: rows within one second may be equal.
 _MOST_EQUAL = 0.3
+# A comment about units or the clock, which belongs to all columns.
+_UNITS_ABOVE = re.compile(r"(?i)\W*[#%;].*\b(feet|ft|inch|miles|knots|dbuv|dbw|mw|utc ?[+-]|offset|local time)")
 _YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
 # Names contain a letter. A column with more texts than this counts something.
 _LETTER, _MOST_SOURCES, _MOST_NUMBERS = re.compile(r"[^\W\d_]"), 50, 8
@@ -521,7 +527,7 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet:
         entries = zip(parsed.row.tolist(), parsed.values, strict=True)
         readings = [(i, reading) for i, entry in entries for reading in _json.readings(entry)]
         return of_readings(lines, readings, parsed.rejected)
-    header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
+    header = header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         raise InputError("no header with a time and a level, ratio, rank or position", expected="names of columns")
     sheet = cut(_text.split(data), *header)
@@ -714,7 +720,7 @@ class _Header:
         self.names = names
         self.place = list(range(len(names)))  # column of each field under the present header
         self._unit = [""] * len(names)  # unit of each field that differs from that of the first header
-        self._known, self._repeated = {dictionary.without_unit(name)[0] for name in names}, False
+        self._bare, self._repeated = [dictionary.without_unit(name)[0] for name in names], False
 
     def adds_units(self, texts: list[str]) -> bool:
         """Check whether the line below the names contains their units, and add the units to the names."""
@@ -731,18 +737,18 @@ class _Header:
         texts = _unique_names(texts)
         bare = [dictionary.without_unit(text) for text in texts]
         both = zip(bare, texts, strict=True)
-        known = [name in self._known or dictionary.meaning(text) is not None for (name, _), text in both]
+        known = [name in self._bare or dictionary.meaning(text) is not None for (name, _), text in both]
         if len(texts) < 2 or 2 * sum(known) <= sum(bool(text) for text in texts):
             return False
         spare: dict[str, list[int]] = {}
-        for j, name in enumerate(self.names):
-            spare.setdefault(dictionary.without_unit(name)[0], []).append(j)
+        for j, name in enumerate(self._bare):
+            spare.setdefault(name, []).append(j)
         self.place, self._unit, self._repeated = [], [], True
         for (name, unit), text in zip(bare, texts, strict=True):
             if not spare.get(name):
                 spare[name] = [len(self.names)]
                 self.names.append(text)
-                self._known.add(name)
+                self._bare.append(name)
             column = spare[name].pop(0)
             self.place.append(column)
             changed = dictionary.is_unit(unit) and unit != dictionary.without_unit(self.names[column])[1]
@@ -850,7 +856,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         sheet.row, sheet.cells = sheet.row[timed.at], [sheet.cells[i] for i in timed.at.tolist()]
         sheet._numbers.clear()
     for per_ms, names in ((1.0, ("time millisecond", "millisecond", "milliseconds", "msec", "ms")), (1e6, _NSECS)):
-        if (counter := sheet.named(*names)) not in (None, column):
+        if (counter := sheet.named(*names)) not in (None, column) and np.isfinite(sheet.numbers(counter)).any():
             sheet.used.add(counter)
             _add_milliseconds(timed, sheet.numbers(counter) / per_ms)
     if (valid := sheet.named("valid", "is valid", "data valid")) is not None:
@@ -988,6 +994,9 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         )
         text = f"read as seconds, although {who} {count}"
         sheet.notes[column], count = f"column {sheet.names[column]!r}: {text}", None
+    if "local" in name and np.nanmax(sheet.numbers(column), initial=0) > _EPOCH_S[0]:
+        text = "epochs are read as UTC: if they are local, write 'clock: local_as_utc' next to the log in flight.yaml"
+        sheet.notes[column] = f"column {sheet.names[column]!r}: {text}"
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
     if day is not None and not zone and "local" not in name:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
@@ -1028,18 +1037,17 @@ def _devices(sheet: Sheet) -> IntArray | None:
 
 def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options: ReadOptions) -> tuple[str, list[str]]:
     """Return the zone in a column of zones, or an empty zone and the times with their zones if there are several."""
-    cells = sheet.texts(column)
+    cells, name = sheet.texts(column), f"column {sheet.names[column]!r}"
     known = {text: "" if text.lower() in _NO_ZONE else _stamps.zone_of_cell(text) for text in cells}
     word = next(filter(None, known.values()), "")
     if unknown := next((text for text, own in known.items() if not own and text.lower() not in _NO_ZONE), ""):
-        sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is not a known zone: not used"
+        sheet.notes[column] = f"{name}: {unknown[:30]!r} is not a known zone: not used"
     elif zone and word and word != zone:
-        sheet.notes[column] = (
-            f"column {sheet.names[column]!r} contains {word}, but the time column names {zone}: {zone} is used"
-        )
+        sheet.notes[column] = f"{name} contains {word}, but the time column names {zone}: {zone} is used"
     elif word and options.timezone not in (None, word) and not all(map(_DATED.fullmatch, texts[:3])):
-        text = f"column {sheet.names[column]!r} has the zone of the times, {word}: --timezone is not used"
-        sheet.notes[column] = text
+        sheet.notes[column] = f"{name} has the zone of the times, {word}: --timezone is not used"
+    if word and "offset" in sheet.plain[column] and re.fullmatch(r"\d{2,3}", cells[0]):
+        sheet.notes[column] = f"{name}: {cells[0]} is read as east of UTC, but JavaScript counts to the west"
     if zone or len({*known.values()}) == 1:
         return zone or word, texts
     both = zip(texts, (known[text] for text in cells), strict=True)

@@ -50,11 +50,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 READER = Reader(
-    name="cell_search",
+    name="cell_search", kinds=("rss",), sniff=sniff, read=read,
     title="AERPAW cell search (srsRAN), console or table: power of the synchronisation signal per cell",
-    kinds=("rss",),
     sample="Found CELL MHz, 3500.0,  EARFCN, 7399, PHYID, 1, PRB, 50,  ports, 1, PSS power dBm, -30.1,  PSR, 2.3, "
     "2025-01-01 12:00:07:250",
-    sniff=sniff,
-    read=read,
-)
+)  # fmt: skip

@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 import pandas as pd
@@ -119,7 +120,8 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     """Return the cells of the table, the columns of other quantities, and the columns of ranks."""
     cells: dict[tuple[str, str], _Cell] = {}
     fields: dict[tuple[str, str], dict[str, list[int]]] = {}
-    others, ranks, marks = [], [], []
+    others, marks = [], []
+    ranks: dict[bool, list[int]] = {True: [], False: []}  # by whether they are means
     for i, meaning in enumerate(sheet.meanings):
         if meaning is not None and meaning.quantity.role == "mark":
             marks.append((i, meaning))
@@ -129,7 +131,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
         if meaning.indirect or sheet.unit(i) == "%" or (name is None and role in ("rss", "kpi")):
             others.append(i)
         elif role == "rank":
-            ranks.append(i)
+            ranks[meaning.part == "mean"].append(i)
         elif name is not None:
             place = (meaning.rat, meaning.place)
             fields.setdefault(place, {}).setdefault(name, []).append(i)
@@ -143,6 +145,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
             if name == "rsrp_dbm":
                 cell.ports = [i for i in second if _part(sheet, i) != "mean"]
             others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # read as KPIs
+    others += ranks[True] if ranks[False] else []
     with_rsrp = {place for (_, place), cell in cells.items() if "rsrp_dbm" in cell.columns}
     for cell in cells.values():
         cell.marks = [i for i, mark in marks if mark.place == cell.place and mark.rat in ("", cell.rat)]
@@ -156,7 +159,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     placed = _completed(cells, others)
     if len(placed) == 1:
         placed[0].place = "serving"  # a single column such as 'rsrp1' is the serving cell
-    return placed, others, ranks
+    return placed, others, ranks[False] or ranks[True]
 
 
 _FIELDS = {quantity: name for name, quantity in _cells.QUANTITIES.items()}
@@ -167,11 +170,12 @@ def _part(sheet: _sheet.Sheet, column: int) -> str:
     return "" if meaning is None else meaning.part
 
 
-def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, int]:
-    """Return a sort key that prefers columns that are neither means nor single ports, then many values."""
+def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
+    """Return a sort key that prefers columns that are neither means nor single ports, then plain names, many values."""
     known = sheet.numbers(column)
     count = len(np.unique(known[np.isfinite(known)]))
-    return _part(sheet, column) == "mean", _part(sheet, column) == "port", -count
+    part = _part(sheet, column)
+    return part == "mean", part == "port", _MORE.sub("", sheet.plain[column]).strip() != "", -count
 
 
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
@@ -387,10 +391,18 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     for i in columns:
         # a rank next to levels is that of the serving cell, which changes
         of_cells = "rss" not in direct if i in ranks else _is_level(sheet, i, alone)
-        parts = _identity.parts(rows, sheet, "PCI", "ARFCN", found=False) if of_cells else [("", rows, sheet)]
+        parts = _identity.parts(rows, sheet, *_keys(sheet, i), found=False) if of_cells else [("", rows, sheet)]
         for label, part, inner in parts:
             shown.append(_renamed(_rank(part, inner, i) if i in ranks else _other(part, inner, i, alone), label))
     return [*levels, *shown]
+
+
+def _keys(sheet: _sheet.Sheet, column: int) -> list[str]:
+    """Return the quantities that divide the levels of a column, among them the radio access if there are several."""
+    technology = sheet.find("technology")
+    known = np.isfinite(sheet.numbers(column)).tolist()
+    rats = set() if technology is None else {_rat(text) for text in compress(sheet.texts(technology), known)}
+    return ["PCI", "ARFCN", *(["technology"] if len(rats) > 1 else [])]
 
 
 def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
@@ -442,8 +454,12 @@ _NUMBERED = 0.8
 
 def _short(sheet: _sheet.Sheet, column: int) -> str:
     """Return a short name for a column: the words of its name without those of its quantity."""
-    words = re.sub(r"\b(\w*rsrp|dbm|lte|nr|4g|5g|serving)\b", " ", sheet.plain[column])
-    return "_".join(words.split()) or f"column{column + 1}"
+    return "_".join(_SHARED.sub(" ", sheet.plain[column]).split()) or f"column{column + 1}"
+
+
+# Words that the names of several levels of one cell share, and further words for a measured level.
+_SHARED = re.compile(r"\b(\w*rsrp|dbm|lte|nr|4g|5g|serving)\b")
+_MORE = re.compile(rf"{_SHARED.pattern}|\b(rssi|raw|meas(ured)?|inst|cell|ss|current)\b")
 
 
 def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: list[int]) -> None:

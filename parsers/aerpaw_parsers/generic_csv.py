@@ -9,7 +9,6 @@ name of the column, or the steps between the rows, require another unit.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,7 @@ from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import dictionary
 from aerpaw_cmp.logs.readers import unknown_name
-from aerpaw_cmp.logs.text import Lines, add_flag, no_flags, split
+from aerpaw_cmp.logs.text import add_flag, no_flags, split
 from aerpaw_cmp.readers import COLUMNS, Kind, Reader, ReadOptions, ReadResult, Rows, Stream
 
 from . import _identity, _pose, _sheet
@@ -125,12 +124,18 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if lines.blank.all():
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
     first = int(np.argmin(lines.blank))
+    head = [lines.raw(i) for i in range(first, min(first + _sheet.TITLES, len(lines)))]
+
+    def are_named(names: list[str]) -> bool:
+        return all({name, _UNIT.sub("", name)} & {*names} for name in options.columns.values())
+
     # the header is the line with the columns that the user named, else the first line
-    known = (item for item in _tables(lines, first) if {*options.columns.values()} <= {*item[2]})
-    first, separator, header = next(known, next(_tables(lines, first)))
+    header_of = _sheet.header_of(head, are_named) or _sheet.header_of(head, lambda _names: True)
+    at, separator, header = header_of or (0, ",", [lines.text(first)])
     # proposed options name columns with the unit of the line below the header
     bare = {key: name if name in header else _UNIT.sub("", name) for key, name in options.columns.items()}
     options = replace(options, columns=bare) if {*bare.values()} <= {*header} else options
+    first += at
     kind, where = _checked(options, header)
     sheet = _sheet.cut(lines, first, separator, header)
     sheet.used |= {*where.values()}
@@ -186,17 +191,6 @@ def _refuse_other_numbers(sheet: _sheet.Sheet, column: int, options: ReadOptions
         found, name = f"all levels are between 0 and 1, such as {values[0]:.3g}", sheet.names[column]
         expected = f"decibels, or the unit in the header: '{name} [mW]', or '{name} [linear]' for a power of full scale"
         raise InputError(found, expected=expected, cause="linear powers")
-
-
-def _tables(lines: Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
-    """Yield index, separator and names of each line that may be the header, starting at ``first``."""
-    for i in range(first, min(first + _sheet.TITLES, len(lines))):
-        line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
-        # names may have spaces, so these separate only if nothing else does
-        *marks, wide, narrow = (sign.encode() for sign in _sheet.SEPARATORS)
-        known = max(marks, key=line.count)
-        separator = (known if known in line else wide if wide in line else narrow).decode()
-        yield i, separator, [name.strip() for name in _sheet.split_row(line, separator)]
 
 
 # Heights above take-off, None if they stay as they are written, and the attributes about their source.

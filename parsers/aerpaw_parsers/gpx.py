@@ -14,8 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from aerpaw_cmp.common.units import IntArray
-from aerpaw_cmp.readers import InputError, Lines, Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, split
+from aerpaw_cmp.readers import InputError, Lines, Reader, ReadOptions, ReadResult, RejectedLine, Stream, split
 
 from . import _pose, _sheet, drive_test
 
@@ -72,7 +71,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
     parts = {"": (rows, sheet)}
-    if _overlap(rows, track):
+    # tracks that run at the same time are those of several devices
+    spans = sorted((rows.time[track == i].min(), rows.time[track == i].max()) for i in np.unique(track))
+    if any(start < end for (_, end), (start, _) in pairwise(spans)):
         parts = {f"_{i}": (rows.part(track == i), sheet.part(track == i)) for i in np.unique(track).tolist()}
     streams: list[Stream | None] = []
     for suffix, (part, cells) in parts.items():
@@ -82,12 +83,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         streams += drive_test.of_radio(part, cells) if drive_test.has_radio(sheet.names) else []
     rows.warnings += [*_sheet.way_to_level(sheet), *sheet.remarks()]
     return rows.result(streams)
-
-
-def _overlap(rows: Rows, track: IntArray) -> bool:
-    """Check whether tracks of one file run at the same time, as those of two devices do."""
-    spans = sorted((rows.time[track == i].min(), rows.time[track == i].max()) for i in np.unique(track))
-    return any(start < end for (_, end), (start, _) in pairwise(spans))
 
 
 def _torn(lines: Lines, data: bytes, row: object) -> list[RejectedLine]:

@@ -99,10 +99,7 @@ def _measured(rows: Rows, name: str, where: BoolArray) -> Stream | None:
 
 
 READER = Reader(
-    name="nemo_kml",
+    name="nemo_kml", kinds=("rank", "rss", "kpi", "telemetry"), sniff=sniff, read=read,
     title="Keysight Nemo KML: NR rank, RSRP, RSRQ, SINR, CQI or throughput along a flight (also gzipped)",
-    kinds=("rank", "rss", "kpi", "telemetry"),
     sample="<description>... rel_time = -1500.0 ms ... PDSCH rank (NR) = 2.0 ... (lat, lon) = (35.728,-78.696) ...",
-    sniff=sniff,
-    read=read,
-)
+)  # fmt: skip

@@ -264,3 +264,29 @@ def test_a_temperature_in_rows_of_one_second_is_no_source_and_a_name_is_one(
     result = read(tmp_path / "x.csv", "timestamp,pci,rsrp,spot\n" + "\n".join(lines) + "\n")
     asked = any("'spot'" in text and "does it name the device" in text for text in result.warnings)
     assert ([stream.rows for stream in result.streams] == [200]) is asked is (level(1) == -71)
+
+
+@pytest.mark.parametrize("name", ["rsrp_sim", "rsrp_lstm", "prev_rsrp", "rsrp_scaled", "rsrp_peak", "xq_rsrp"])
+@pytest.mark.parametrize("own", ["rsrp", "RSRP [dBm]", "rsrp_raw"])
+def test_the_plain_name_of_a_level_wins(name: str, own: str, tmp_path: Path) -> None:
+    """A simulated level has more distinct values than a measured one."""
+    rows = [f"11,{-95 - 0.37 * i},{-70 - i % 2}" for i in range(30)]
+    text = f"timestamp,pci,{name},{own}\n" + "".join(f"{1749564000 + i},{row}\n" for i, row in enumerate(rows))
+    (level,) = (stream for stream in read(tmp_path / "x.csv", text).streams if stream.name == "pci11")
+    assert set(level.frame["rss_db"]) == {-70, -71}
+
+
+@pytest.mark.parametrize("name", ["technology", "rat", "network"])
+@pytest.mark.parametrize("level", ["rsrp", "rssi_dbm"])
+def test_levels_of_two_radio_accesses_are_two_series(name: str, level: str, tmp_path: Path) -> None:
+    rows = [f"{'LTE' if i < 20 else 'NR'},{-70 if i < 20 else -95}" for i in range(40)]
+    assert levels_by_cell(tmp_path / "x.csv", f"{name},{level}", rows) == [[-95], [-70]]
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("MS", "A1 B2"), ("id", "1 2"), ("cc", "0 1"), ("radio", "A1 B2"), ("source", "A1 B2")]
+)
+def test_short_names_are_asked_about(name: str, values: str, tmp_path: Path) -> None:
+    rows = "".join(f"{1749564000 + i},{values.split()[i // 20]},{-80 - i % 7}\n" for i in range(40))
+    result = read(tmp_path / "x.csv", f"time,{name},rsrp\n{rows}")
+    assert any(f"'{name}'" in text for text in result.warnings) or len(result.streams) == 2

@@ -500,3 +500,47 @@ def test_the_day_comes_first_in_europe() -> None:
         for zone in ("Europe/Paris", "America/New_York")
     }
     assert months == {"Europe/Paris": 4, "America/New_York": 3}
+
+
+@pytest.mark.parametrize("names", ["azimuth,elevation", "azimuth_deg,elev", "elevation_deg,x", "altitude_m,elevation"])
+def test_an_elevation_may_be_an_angle_or_the_ground(names: str) -> None:
+    rows = "".join(f"2025-03-02 10:00:{i:02d},35.73,-78.7,{100 + i},{40 + i % 2}\n" for i in range(12))
+    (track,) = read("pose_csv", f"time utc,lat,lon,{names}\n{rows}".encode()).streams
+    heights = track.frame["altitude_m"].dropna().tolist()
+    assert [height - 100 for height in heights] == ([] if "alt" not in names else [*range(12)])
+
+
+def test_a_header_again_below_units_keeps_its_columns() -> None:
+    lines = ["1749564000,35.73,-78.7,10", "1749564001,35.73,-78.7,11"]
+    for units in ("s,deg,deg,m", "UTC,deg,deg,m"):
+        rows = [line.replace("17495640", "2025-03-02T10:00:") if "UTC" in units else line for line in lines]
+        text = "\n".join(["time,lat,lon,alt", units, *rows, "time,lat,lon,alt", *rows]) + "\n"
+        assert read("pose_csv", text.encode()).accepted == 4
+
+
+def test_the_order_of_rows_does_not_change_heights() -> None:
+    rows = [f"2025-03-02T15:00:{i:02d}Z,{35.73 + 1e-5 * max(0, i - 5)},-78.7,{120 + max(0, i - 5)}" for i in range(40)]
+    heights = [
+        read("pose_csv", "\n".join(["time,lat,lon,alt msl", *listed, ""]).encode()).streams[0].frame["altitude_m"]
+        for listed in (rows, rows[::-1])
+    ]
+    assert heights[0].tolist() == heights[1].tolist()[::-1]
+
+
+@pytest.mark.parametrize("name", ["dl_ri_avg", "ri_avg"])
+def test_a_mean_of_ranks_next_to_a_rank_is_a_kpi(name: str) -> None:
+    data = f"time,{name},ri\n1749564000,4,2\n1749564001,4,3\n".encode()
+    assert [s.frame["rank"].tolist() for s in read("drive_test", data).streams if s.kind == "rank"] == [[2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("# all altitudes in feet\ntime utc,lat,lon,alt agl\n2025-03-02 10:00:00,35.73,-78.7,100\n", "in feet"),
+        ("local_epoch,pci,rsrp\n1749564000,11,-80\n", "local_as_utc"),
+        ("time,timezoneOffset,pci,rsrp\n2025-03-02 10:00:00,240,11,-80\n", "JavaScript"),
+    ],
+)
+def test_what_the_reader_cannot_know_is_said(text: str, word: str) -> None:
+    reader = "drive_test" if "rsrp" in text else "pose_csv"
+    assert any(word in warning for warning in read(reader, text.encode()).warnings)

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.geodesy import azimuth_rad, elevation_rad
+from ..common.grouping import lists_by_key
 from ..common.units import BoolArray, FloatArray, IntArray, spread_out, wrap_degrees
 from . import gains
 from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
@@ -370,9 +371,7 @@ def score_with(learned: Learned, unseen: Sequence[Observed], train: Sequence[Obs
 
 def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]:
     """Return the mean over flights of measured minus predicted, by antenna [dB]."""
-    each: dict[str, list[float]] = {}
-    for samples in train:
-        each.setdefault(samples.antenna, []).append(learned.mean_error(samples))
+    each = lists_by_key((samples.antenna, learned.mean_error(samples)) for samples in train)
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
 
@@ -875,9 +874,7 @@ def _sd_factor(flights: Sequence[str], parts: Sequence[_HeldOut]) -> float:
     with large errors, and the reverse. An arithmetic mean would give the first case more weight, although the final
     model is fitted to both kinds.
     """
-    squares: dict[str, list[FloatArray]] = {}
-    for flight, (error, sd) in zip(flights, parts, strict=True):
-        squares.setdefault(flight, []).append(np.square(error / sd))
+    squares = lists_by_key(zip(flights, (np.square(error / sd) for error, sd in parts), strict=True))
     means = [_mean(np.concatenate(each)) for each in squares.values()]
     logs = [math.log(max(mean, 1e-12)) for mean in means if math.isfinite(mean)]
     return min(max(math.exp(0.5 * sum(logs) / len(logs)), 0.8), 1.6) if logs else 1.0

@@ -22,6 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.grouping import lists_by_key
 from ..common.units import BoolArray, FloatArray, unmasked
 from . import statistics
 from .level import DetectionScore, floored_fit
@@ -424,10 +425,7 @@ def by_flight(
 
 
 def _means(errors_db: Iterable[tuple[str, float]]) -> dict[str, float]:
-    each: dict[str, list[float]] = {}
-    for flight, error in errors_db:
-        if math.isfinite(error):
-            each.setdefault(flight, []).append(error)
+    each = lists_by_key((flight, error) for flight, error in errors_db if math.isfinite(error))
     return {flight: float(np.mean(values)) for flight, values in each.items()}
 
 

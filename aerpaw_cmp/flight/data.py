@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from ..common.errors import InputError, UsageError
+from ..common.grouping import lists_by_key
 from ..common.text import counted
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..common.yamlfile import nearest
@@ -914,9 +915,7 @@ def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str])
     UsageError
         If two logs contain the same series at the same time, because only one could be compared.
     """
-    groups: dict[str, list[tuple[str, Series]]] = {}
-    for path, series in parts:
-        groups.setdefault(name(series), []).append((path, series))
+    groups = lists_by_key((name(series), (path, series)) for path, series in parts)
     return tuple(_record(what, group) for what, group in groups.items())
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from ..common.errors import InputError, UsageError
+from ..common.grouping import lists_by_key
 from ..common.stages import Progress, Stages, logged
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray
@@ -147,10 +148,8 @@ def replay_rss(
     data: FlightData, progress: Progress = logged, clocks: Sequence[Clock | None] | None = None
 ) -> list[Replayed]:
     """Replay every RSS series. Series of one tower with equal links share a replay."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for index, series in enumerate(data.rss):
-        # one search of paths for all channels that share a link
-        groups.setdefault((series.tower, series.settings_key), []).append(index)
+    # one search of paths for all channels that share a link
+    groups = lists_by_key(((series.tower, series.settings_key), index) for index, series in enumerate(data.rss))
     shifts = clocks or [None] * len(data.rss)
     rt, out = data.settings.rt, dict[int, Replayed]()
     for members in groups.values():

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..common.content import KEY, MARKS, union
 from ..common.errors import InputError, UsageError, parsing
+from ..common.grouping import lists_by_key
 from ..common.jsonable import json_safe
 from ..common.units import FloatArray, IntArray
 from ..compare import receiver
@@ -281,10 +282,7 @@ def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
 
 def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSamples]]:
     """Return the reports of all flights by tower. Raise InputError if there are none."""
-    towers: dict[str, list[RankSamples]] = {}
-    for data in flights:
-        for series in data.rank:
-            towers.setdefault(series.tower, []).append(rank_samples(data, series))
+    towers = lists_by_key((series.tower, rank_samples(data, series)) for data in flights for series in data.rank)
     if not towers:
         raise InputError("none of the flights has rank", expected="rank logs", cause="'rank:' in calibration.yaml")
     return towers

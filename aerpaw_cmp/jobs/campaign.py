@@ -26,6 +26,7 @@ import pandas as pd
 from pydantic import Field
 
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line
+from ..common.grouping import lists_by_key
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
 from ..common.units import FloatArray, finite_mean
@@ -291,9 +292,7 @@ def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: i
     The time of a task is the mean time of the stored tasks of its setting, divided by ``workers``. If its setting has
     no stored task, the mean is taken over all stored tasks. If there is no stored task, the time is unknown.
     """
-    spent: dict[str, list[float]] = {}
-    for number, outcome in kept.items():
-        spent.setdefault(tasks[number].setting, []).append(outcome.seconds)
+    spent = lists_by_key((tasks[number].setting, outcome.seconds) for number, outcome in kept.items())
     every = [seconds for some in spent.values() for seconds in some]
     stages = []
     for setting in dict.fromkeys(task.setting for task in tasks):
@@ -629,9 +628,7 @@ def _iso(ns: int) -> str:
 
 def _held_out_rows(rows: Sequence[page.RssRow]) -> list[page.RssRow]:
     """Return rows with the RMSE after the offset of the other flights of the same setting, tower and channel."""
-    groups: dict[tuple[str, str, str, str], list[int]] = {}
-    for i, row in enumerate(rows):
-        groups.setdefault((row.setting, row.tower, row.channel, row.unit), []).append(i)
+    groups = lists_by_key(((row.setting, row.tower, row.channel, row.unit), i) for i, row in enumerate(rows))
     scored = list(rows)
     for members in groups.values():
         mine = [rows[i] for i in members]

@@ -17,6 +17,7 @@ import pandas as pd
 
 from ..common.errors import InputError, UsageError, parsing
 from ..common.geodesy import azimuth_rad
+from ..common.grouping import lists_by_key
 from ..common.text import counted
 from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import BIN_S, Correction, Observed, Predictor, between_blocks_db, by_degree
@@ -464,10 +465,8 @@ def track_m(samples: LinkSamples) -> FloatArray:
 
 def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
     """Return links of fixed towers and the channels that a flight received, by antenna."""
-    measured: dict[str, list[LinkSamples]] = {}
-    for o in observed:
-        if np.isfinite(o.samples.residual_db).any():
-            measured.setdefault(o.samples.antenna, []).append(o.samples)
+    with_level = (o.samples for o in observed if np.isfinite(o.samples.residual_db).any())
+    measured = lists_by_key((samples.antenna, samples) for samples in with_level)
     out: dict[str, Source] = {}
     for data, s in [(flight, series) for flight in known for series in flight.rss]:
         source = Source(

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from ..common.grouping import lists_by_key
 from ..common.jsonable import fields_of, json_safe
 from ..common.text import counted, guarded
 from ..common.units import FloatArray
@@ -300,9 +301,7 @@ _FEW_PAIRS = 0.25
 
 def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
     """Return the mean RMSE over the links of each setting and flight [dB], NaN for failed flights."""
-    errors: dict[tuple[str, str], list[float]] = {}
-    for row in data.rss:
-        errors.setdefault((row.setting, row.flight), []).append(row.rmse_db)
+    errors = lists_by_key(((row.setting, row.flight), row.rmse_db) for row in data.rss)
     means = {key: float(np.nanmean(each)) for key, each in errors.items() if np.isfinite(each).any()}
     only_rank = {row.flight for row in data.rank} - {row.flight for row in data.rss}
     flights = [name for name in data.flights if name not in only_rank]
@@ -366,10 +365,8 @@ def warnings(data: CampaignData) -> list[str]:
     out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
     if len(data.failures) > FEW:
         out = [f"{len(data.failures)} flights or settings have no numbers; see Failures."]
-    learned: dict[str, list[str]] = {}
-    for row in data.rss:
-        if LEARNED_HERE in row.fitted:
-            learned.setdefault(f"{row.flight}, {row.setting}", []).append(row.link)
+    trained = (row for row in data.rss if LEARNED_HERE in row.fitted)
+    learned = lists_by_key((f"{row.flight}, {row.setting}", row.link) for row in trained)
     out += [
         f"{name}: its antennas were learned from this log, so it is not scored ({', '.join(links)})."
         for name, links in learned.items()
@@ -397,10 +394,7 @@ def edge_warnings(data: CampaignData) -> list[str]:
 
 def by_error(rows: Iterable[RssRow]) -> list[tuple[str, float, str]]:
     """Return flights by error (:attr:`RssRow.error_db`), largest first: name, mean over links [dB], worst link."""
-    by: dict[str, list[tuple[float, str]]] = {}
-    for row in rows:
-        if np.isfinite(row.error_db):
-            by.setdefault(row.flight, []).append((row.error_db, row.link))
+    by = lists_by_key((row.flight, (row.error_db, row.link)) for row in rows if np.isfinite(row.error_db))
     flights = [(name, float(np.mean([e for e, _ in of])), max(of)[1]) for name, of in by.items()]
     return sorted(flights, key=lambda entry: -entry[1])
 

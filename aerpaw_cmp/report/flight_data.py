@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.grouping import lists_by_key
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, IntArray
 from ..common.versions import utc_now, versions
@@ -277,9 +278,8 @@ def clock_warnings(clocks: Mapping[str, ClockResult], cause: Cause | None = None
     named = cause.channels if cause is not None and "clock" in cause.name.split(" or ") else ()
     late = {channel.partition(" ")[0] for channel in named}
     clocks = {receiver: clock for receiver, clock in clocks.items() if not (clock.shifted and receiver in late)}
-    receivers: dict[str, list[str]] = {}
-    for receiver in sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED):
-        receivers.setdefault(_clock_warning(clocks[receiver]), []).append(receiver)
+    ordered = sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED)
+    receivers = lists_by_key((_clock_warning(clocks[receiver]), receiver) for receiver in ordered)
     return tuple(f"{', '.join(names)}: {text}" for text, names in receivers.items() if text)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.grouping import lists_by_key
 from ..common.text import counted
 from ..common.units import AnyArray, Printed
 from ..compare.evidence import FEWEST_SAMPLES
@@ -482,10 +483,8 @@ def offset_sentences(panels: Sequence[RssResult]) -> list[str]:
     >>> offset_sentences([])
     []
     """
-    known: dict[str, list[float]] = {}
-    for panel in scored(panels):
-        if panel.score.offset_db < 0.0 or panel.score.offset_db >= _LARGE_OFFSET_DB:
-            known.setdefault(panel.unit, []).append(panel.score.offset_db)
+    offsets = ((panel.unit, panel.score.offset_db) for panel in scored(panels))
+    known = lists_by_key((unit, of) for unit, of in offsets if of < 0.0 or of >= _LARGE_OFFSET_DB)
     return [
         f"Offset {' to '.join(dict.fromkeys(signed(end) for end in (min(of), max(of))))} dB: {OFFSETS[unit]}."
         for unit, of in known.items() if unit in OFFSETS

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ..common.geodesy import SiteFrame
+from ..common.grouping import lists_by_key
 from ..common.jsonable import json_object, json_safe
 from ..common.kml import CLASS_COLOURS
 from ..common.text import counted
@@ -249,10 +250,7 @@ COLUMNS = 6
 
 def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
     """Return items under their keys, in the order of first appearance."""
-    result: dict[Any, list[T]] = {}
-    for item in items:
-        result.setdefault(key(item), []).append(item)
-    return result
+    return lists_by_key((key(item), item) for item in items)
 
 
 # --- one map ------------------------------------------------------------------------------------

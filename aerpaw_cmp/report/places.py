@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.grouping import lists_by_key
 from ..common.kml import CLASS_COLOURS
 from ..common.units import FloatArray, spread_out
 from ..site.site import Site
@@ -89,10 +90,11 @@ def payload(
         Values that JSON can store; arrays are in ``packed``.
     """
     arrays, total = PackedArrays(), sum(group.at.shape[0] * len(group.values) for group in groups)
-    alike: dict[tuple[str, str], list[FloatArray]] = {}
-    for group in groups:
-        for name, column in group.values.items():
-            alike.setdefault(_scale(group.name, name), []).append(np.asarray(column, dtype=np.float64))
+    alike = lists_by_key(
+        (_scale(group.name, name), np.asarray(column, dtype=np.float64))
+        for group in groups
+        for name, column in group.values.items()
+    )
     every = {key: np.concatenate(columns) for key, columns in alike.items()}
     ranges = {key: _range(key[1], values[np.isfinite(values)]) for key, values in every.items()}
     return {

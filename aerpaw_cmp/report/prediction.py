@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..common.cf import DB, Dataset, file_attributes, netcdf_bytes
 from ..common.errors import UsageError
+from ..common.grouping import lists_by_key
 from ..common.jsonable import json_object
 from ..common.text import guarded
 from ..common.units import FloatArray
@@ -164,9 +165,7 @@ def cautions(correction: Correction, outside: float) -> list[str]:
 
 def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float) -> list[str]:
     """Return warnings for a prediction from learned models of the site, without flights."""
-    each: dict[str, list[str]] = {}
-    for entry, series in known:
-        each.setdefault(entry.about(), []).append(f"{series.tower} {series.channel}")
+    each = lists_by_key((entry.about(), f"{series.tower} {series.channel}") for entry, series in known)
     texts = filled([OUTSIDE["remembered"]], percent=100.0 * outside) if outside > MANY else []
     return [*texts, *(f"{', '.join(names)}: {about}." for about, names in each.items())]
 

@@ -25,6 +25,7 @@ from shapely.geometry.base import BaseGeometry
 
 from ..common.errors import InputError, UsageError, about_file
 from ..common.geodesy import SiteFrame
+from ..common.grouping import lists_by_key
 from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
@@ -538,10 +539,8 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
     # ignore tiny overlaps: neighbours share a wall, with rounding errors along it
     overlap = shapely.area(shapely.intersection(areas[first], areas[second])) > 0.01
     pairs = coo_array((overlap[overlap], (first[overlap], second[overlap])), shape=(len(shapes), len(shapes)))
-    groups: dict[int, list[_Shape]] = {}
-    for group, shape in zip(connected_components(pairs, directed=False)[1].tolist(), shapes, strict=True):
-        groups.setdefault(group, []).append(shape)
-    return list(groups.values())
+    groups = connected_components(pairs, directed=False)[1].tolist()
+    return list(lists_by_key(zip(groups, shapes, strict=True)).values())
 
 
 def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 
 from ...common.errors import UsageError
+from ...common.grouping import lists_by_key
 from ...common.stages import duration
 from ..app import Force, command, output
 from ..shown import answered, records, say, show, table
@@ -108,9 +109,7 @@ def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tupl
 
 
 def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> list[str]:
-    kinds: dict[str, list[str]] = {}
-    for stream in file["streams"]:
-        kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
+    kinds = lists_by_key((stream["kind"], f"{stream['name']} {stream['rows']}") for stream in file["streams"])
     streams = "; ".join(
         f"{kind}: {', '.join(names) if every_stream or len(names) <= _MOST_NAMED else f'{len(names)} (--all)'}"
         for kind, names in kinds.items()

@@ -151,8 +151,9 @@ def _read_metrics(place: Path) -> dict[str, Any]:
     file = place / "metrics.json"
     if not file.is_file():
         campaign = (place / "campaign.json").is_file()
+        reason = "there is no metrics.json" if place.is_dir() else "there is no such folder"
         raise InputError(
-            "there is no metrics.json" if place.is_dir() else "there is no such file or folder",
+            "this is a file" if place.is_file() else reason,
             expected="the folder of a report",
             cause="the folder has campaign.json: only reports of a flight can be compared" if campaign else None,
             path=place,

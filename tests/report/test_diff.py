@@ -294,7 +294,8 @@ BAD = {
     "numbers for links": (lambda f: change_metrics(f, lambda m: m["rss"].update(LW1=[3])), r"has no 'rss', which every report writes", InputError),
     "a torn json": (lambda f: (f / "metrics.json").write_text('{"flight": '), r"a truncated copy", InputError),
     "a campaign": (lambda f: (f / "metrics.json").rename(f / "campaign.json"), r"no metrics\.json.*campaign\.json", InputError),
-    "nothing": (shutil.rmtree, r"no such file or folder", InputError),
+    "nothing": (shutil.rmtree, r"there is no such folder; expected the folder of a report", InputError),
+    "a file": (lambda f: (shutil.rmtree(f), f.write_text("{}")), r"this is a file; expected the folder of a report", InputError),
     "another flight": (
         lambda f: change_metrics(f, lambda m: m.update(flight="other", inputs=[])), r"different flights: \S+ and other", UsageError
     ),

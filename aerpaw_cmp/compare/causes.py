@@ -122,10 +122,13 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             lead = _lead(either, odds) / len(showing)
             if all(_explains(other, showing, lead, beside - either) for other in either):
                 named[either] = showing
+        rejected = certain - frozenset().union(*named)
+        if not rejected:
+            break
         # in the second pass, a cause that may not be named takes no credit for a part of the error
-        beside = certain & frozenset().union(*named)
+        beside = certain - rejected
     # an almost certain cause that may not be named shows that no explanation fits
-    if any(_lead({other}, odds) >= _CERTAIN for other in certain - frozenset().union(*named)):
+    if any(_lead({other}, odds) >= _CERTAIN for other in rejected):
         named = {either: shown for either, shown in named.items() if CATCH_ALL not in either}
     if not named:
         return _by_health(None, tables)

@@ -764,11 +764,16 @@ def is_flat(measured_db: FloatArray, predicted_db: Iterable[FloatArray]) -> bool
     return middle_span(measured_db) < _FLAT * min(map(middle_span, predicted_db))
 
 
+def is_stuck(level_db: FloatArray) -> bool:
+    """Check whether a log has at most two different levels (n,), which show nothing about a link."""
+    return len(np.unique(level_db[np.isfinite(level_db)])) <= 2
+
+
 def correlation(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the Pearson correlation over pairs without NaN, NaN if a side is constant or there are fewer than two."""
+    """Return the Pearson correlation over pairs without NaN, NaN if a side is constant or there are fewer than three."""
     a, b = unmasked(first), unmasked(second)
     ok = np.isfinite(a) & np.isfinite(b)
-    if ok.sum() < 2 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
+    if ok.sum() < 3 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
         return float("nan")
     a, b = a[ok] - a[ok].mean(), b[ok] - b[ok].mean()
     return float(np.clip((a @ b) / np.sqrt((a @ a) * (b @ b)), -1.0, 1.0))

@@ -19,7 +19,7 @@ from ..compare.ladder import ModelRow
 from ..compare.level import DetectionScore, ErrorSpan
 from ..compare.receiver import ForecastScore
 from ..compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
-from ..compare.statistics import FEWEST, Interval, paired_verdict
+from ..compare.statistics import FEWEST, Interval, is_stuck, paired_verdict
 from ..compare.verdict import Verdict, baseline_errors, is_dead, is_one_place, lock_lost, pooled_db, scored
 from .flight_data import ReportData
 
@@ -212,7 +212,7 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
 NO_CAUSE = "No likely cause was identified."
 FEW_SAMPLES = "No cause can be identified in fewer than {n} samples."
 NO_MODELS = f"No models are compared: fewer than {FEWEST} samples have a measurement, a pose and a path in every model."
-TWO_LEVELS = "No cause can be identified: the log has two levels only."
+TWO_LEVELS = "No cause can be identified: the log has no more than two different levels."
 ONE_PLACE = "No model predicts a change of 1 dB during this flight, so models cannot be distinguished."
 BEYOND_SPAN = "There is no error to report: the best offset is outside its search range."
 BEYOND = "The best offset of {name} is outside its search range."
@@ -319,9 +319,7 @@ def rss_verdict(panel: RssResult) -> str:
         return training_sentence([panel.name], "the antennas") + _learned_from(panel.further.trained_on or ())
     score = panel.score
     if score.n == 0 or not math.isfinite(score.rmse_db):
-        return (
-            f"{panel.name}: nothing to score, because all of {counted(len(panel.time), 'sample')} are out of coverage."
-        )
+        return f"{panel.name}: nothing to score. {score.n} of {len(panel.time)} samples have level, pose and path."
     text = (
         f"{panel.name}: RMSE of ray tracing {score.rmse_db:.1f} dB"
         f"{_within(score.rmse_ci95_db, panel.further.rmse_bound)} "
@@ -542,15 +540,15 @@ _SMALL_ERROR_DB = 3.0
 
 def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -> str:
     """Return the sentence of a flight without a likely cause, which is empty after a good result."""
+    if all(is_stuck(panel.measured_db) for panel in panels):
+        return TWO_LEVELS  # even if the error is small
     if is_one_place(panels):
         return ONE_PLACE
     good = pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0)
     if good or expected_sentence(panels):  # after a usual error, a sentence about causes would mislead
         return ""
-    if max(panel.score.n for panel in panels) < FEWEST_SAMPLES:
-        return FEW_SAMPLES.format(n=FEWEST_SAMPLES)
-    levels = [np.unique(panel.measured_db[np.isfinite(panel.measured_db)]) for panel in panels]
-    return TWO_LEVELS if all(len(of) == 2 for of in levels) else NO_CAUSE
+    few = max(panel.score.n for panel in panels) < FEWEST_SAMPLES
+    return FEW_SAMPLES.format(n=FEWEST_SAMPLES) if few else NO_CAUSE
 
 
 def _training(data: ReportData) -> str:

@@ -77,7 +77,8 @@ LEVEL = np.full(20, -60.0)
     ("measured", "simulated", "counts", "offset_db", "rmse_db"),
     [
         ([], [], (0, 0, 0), NAN, NAN),
-        ([-60.0], [-80.0], (1, 0, 0), -20.0, 0.0),
+        ([-60.0], [-80.0], (1, 0, 0), -20.0, NAN),
+        ([-60.0, -70.0], [-80.0, -91.0], (2, 0, 0), -20.5, NAN),
         (LEVEL, np.full(20, NAN), (0, 20, 0), NAN, NAN),
         (np.full(20, NAN), LEVEL, (0, 0, 20), NAN, NAN),
         (LEVEL, LEVEL - 15.0, (20, 0, 0), -15.0, 0.0),

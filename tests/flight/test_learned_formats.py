@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 from scipy.signal import lfilter
 
 from aerpaw_cmp.__main__ import main
@@ -348,3 +348,20 @@ def test_levels_choose_the_airframe_for_a_node_at_an_unknown_place(turn_deg, sha
     track = NodeFinder(SITE, vehicle).levels(power)
     airframe = searching_airframe(known_site(tmp_path, turn_deg), (sha256, ""), track, carrier_hz)
     assert (airframe is not None) is found
+
+
+@pytest.mark.parametrize("step_db", [0.0, 0.2])
+def test_a_stuck_receiver_is_not_evidence_of_a_learned_one(step_db, tmp_path, capsys) -> None:
+    """Two channels with one or two levels are not a learned receiver, although they are near its usual level."""
+
+    def stuck(folder: Path) -> None:
+        merged_mat(folder)
+        columns = {name: values for name, values in loadmat(folder / "merged.mat").items() if name[:2] != "__"}
+        for i in (1, 2):
+            # 10 dB above free space at the tower that the draft proposes
+            columns[f"mpower{i}"] = np.median(LEVELS["USRP1"]) - 22.0 + 0.01 * i + step_db * (np.arange(len(TIMES)) % 2)
+        savemat(folder / "merged.mat", columns)
+
+    _, content = drafted(stuck, tmp_path, known_site(tmp_path))
+    assert not {"antennas", "receiver"} & {*content, *content["logs"][0]}
+    capsys.readouterr()

@@ -306,8 +306,11 @@ def test_a_good_result_says_nothing_about_causes(report_data):
     two = dataclasses.replace(
         panel, measured_db=np.where(panel.measured_db > np.nanmedian(panel.measured_db), -60.0, -70.0)
     )
+    stuck = dataclasses.replace(panel, measured_db=0.0 * panel.measured_db - 60.0)
     for rmse_db, low, high, one, said in (
         (2.0, -0.1, 0.4, panel, ""),
+        (0.5, -0.1, 0.4, stuck, TWO_LEVELS),
+        (2.0, -0.1, 0.4, two, TWO_LEVELS),
         (7.0, -1.0, -0.2, panel, ""),
         (7.0, -0.1, 0.4, panel, NO_CAUSE),
         (7.0, -0.1, 0.4, few, FEW_SAMPLES.format(n=100)),

@@ -33,6 +33,7 @@ from ...compare.locate import (
     locate,
     place_odds,
 )
+from ...compare.statistics import is_stuck
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site import learned
@@ -594,9 +595,10 @@ def propose(
     """
     entries = learned.read_learned(place).entries
     found = Proposal()
-    if data.track is not None and data.rss and entries:
+    varying = [series for series in data.rss if not is_stuck(series.measured_db)]
+    if data.track is not None and varying and entries:
         # a ratio to the noise is used only if there is no level
-        levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
+        levels = [s for s in varying if s.channel.lower() not in RATIOS] or varying
         observed, known = [observed_series(data, series)[0] for series in levels], all_learned_links(place)
         evidence = gains.FlightEvidence([o.samples for o in observed])
         bands = (learned.BAND, learned.AIRFRAME_BAND) if carrier_known else (math.inf, math.inf)

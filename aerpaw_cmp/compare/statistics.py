@@ -770,7 +770,7 @@ def is_stuck(level_db: FloatArray) -> bool:
 
 
 def correlation(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the Pearson correlation over pairs without NaN, NaN if a side is constant or there are fewer than three."""
+    """Return the Pearson correlation over pairs without NaN. NaN for a constant side or fewer than three pairs."""
     a, b = unmasked(first), unmasked(second)
     ok = np.isfinite(a) & np.isfinite(b)
     if ok.sum() < 3 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:

@@ -17,7 +17,7 @@ from aerpaw_cmp.compare.result import ModelLevel, RankFurther, RankResult, RssFu
 from aerpaw_cmp.compare.verdict import flight_verdict
 from aerpaw_cmp.jobs.campaign import with_season
 from aerpaw_cmp.report.campaign import CampaignData, Failure, RssRow
-from aerpaw_cmp.report.flight_data import ReportData, Track
+from aerpaw_cmp.report.flight_data import DrawnTrack, ReportData
 from aerpaw_cmp.site.siteyaml import load_site
 
 DRIFT_DB_PER_30_DAYS = 0.4
@@ -198,7 +198,7 @@ def long_flight(samples: int = 50_000, channels: int = 10) -> ReportData:
         panels.append(
             rss_result(tower.name, channel_name, time, place, levels, unit="dBm", geometry={"distance_m": distance})
         )
-    track = Track(time=time, position_m=np.column_stack([east, north, up]))
+    track = DrawnTrack(time=time, position_m=np.column_stack([east, north, up]))
     return ReportData(
         title="A flight that was never flown", flight="long", site=site, generated="2026-11-21T00:00:00+00:00",
         rss=tuple(panels), verdict=flight_verdict(panels), track=track, synthetic=True,

@@ -71,7 +71,7 @@ class InputFile:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
+class DrawnTrack:
     """The track of the UAV: ``time`` (n,), and positions (n, 3) east, north and up in the site frame [m]."""
 
     time: AnyArray
@@ -79,7 +79,7 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Waypoint:
+class DrawnPoint:
     """A named point of the flight, such as ``A`` to ``F`` of the paper."""
 
     label: str
@@ -163,8 +163,8 @@ class ReportData(FlightResult):
     generated: str
     versions: Mapping[str, str] = field(default_factory=dict)
     inputs: tuple[InputFile, ...] = ()
-    track: Track | None = None
-    waypoints: tuple[Waypoint, ...] = ()
+    track: DrawnTrack | None = None
+    waypoints: tuple[DrawnPoint, ...] = ()
     sources: Mapping[str, Source] = field(default_factory=dict)
     synthetic: bool = False
     warnings: tuple[str, ...] = ()
@@ -345,7 +345,7 @@ def _inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tu
     )  # fmt: skip
 
 
-def track_of(data: FlightData) -> Track | None:
+def track_of(data: FlightData) -> DrawnTrack | None:
     """Return the track from the telemetry, or from positions in the rank log."""
     if data.track is not None and len(data.track):
         step_ns = max((data.track.end_ns - data.track.start_ns) // 2000, 500_000_000)
@@ -356,10 +356,10 @@ def track_of(data: FlightData) -> Track | None:
         if placed is None or placed.position_m is None:
             return None
         time, position = placed.time, placed.position_m
-    return Track(time=time, position_m=position)
+    return DrawnTrack(time=time, position_m=position)
 
 
-def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
+def waypoints_of(data: FlightData) -> tuple[DrawnPoint, ...]:
     """Return the waypoints of the plan or of the report settings, each at the time when the track is nearest to it."""
     plan = data.settings.flight.plan
     points = data.settings.report.waypoints or (plan.waypoints if plan else [])
@@ -374,7 +374,7 @@ def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
         # use the first time that is within 2 m of the nearest approach, because later visits belong to later waypoints
         near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
         index = start + int(near[0])
-        out.append(Waypoint(label=point.label, time=track.time[index], east_m=point.east_m, north_m=point.north_m))
+        out.append(DrawnPoint(label=point.label, time=track.time[index], east_m=point.east_m, north_m=point.north_m))
         start = index
     return tuple(out)
 

@@ -17,7 +17,7 @@ from ..common.units import BoolArray, FloatArray, spread_out
 from ..compare.result import PairResult, RankResult, RssResult
 from . import canvas
 from .canvas import FigureSpec, mark
-from .flight_data import RANKS, ReportData, Track, start_of, used_towers
+from .flight_data import RANKS, DrawnTrack, ReportData, start_of, used_towers
 from .flight_words import count, instants, pretty, signed
 from .texts import k_key, number, safe_name
 
@@ -75,7 +75,7 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 # --- track --------------------------------------------------------------------------------------
 
 
-def trajectory(data: ReportData, track: Track) -> Figure:
+def trajectory(data: ReportData, track: DrawnTrack) -> Figure:
     """Draw the flight on the plan of the site, with its height as colour."""
     fig, ax = canvas.subplots((9.2, 7.6))
     canvas.draw_site(ax, data.site)
@@ -104,7 +104,7 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     return fig
 
 
-def altitude(data: ReportData, track: Track) -> Figure:
+def altitude(data: ReportData, track: DrawnTrack) -> Figure:
     """Draw height over time."""
     height = mark("line", "height of the UAV", canvas.seconds_since(track.time, start_of(data)), track.position_m[:, 2])
     return over_time(data, [({"label": "Height above ground [m]"}, [height])], [2.2])

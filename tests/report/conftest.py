@@ -13,7 +13,7 @@ from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, Ran
 from aerpaw_cmp.compare.verdict import flight_verdict
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.maps.variogram import BiExponential, BinnedCorrelation
-from aerpaw_cmp.report.flight_data import InputFile, ReportData, Track, Waypoint
+from aerpaw_cmp.report.flight_data import DrawnPoint, DrawnTrack, InputFile, ReportData
 from aerpaw_cmp.report.maps import Layer, MapError, MapsData, PaperRow, RankMap, RssMap
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Tower, Trees
 from benchmarks.fabricated import rank_result, rss_result
@@ -50,7 +50,7 @@ def make_site() -> Site:
     )
 
 
-def make_track(n: int = 6000) -> Track:
+def make_track(n: int = 6000) -> DrawnTrack:
     s = np.linspace(0.0, 1.0, n)
     legs = 7
     phase = s * legs
@@ -58,10 +58,10 @@ def make_track(n: int = 6000) -> Track:
     north = -80 + 360 * s
     up = 40.0 * np.clip(np.minimum(s / 0.08, (1 - s) / 0.08), 0.0125, 1)
     time = np.datetime64("2024-07-15T17:02:11", "ns") + (s * 950e9).astype("timedelta64[ns]")
-    return Track(time=time, position_m=np.column_stack([east, north, up]))
+    return DrawnTrack(time=time, position_m=np.column_stack([east, north, up]))
 
 
-def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> RssResult:
+def make_rss(site: Site, track: DrawnTrack, tower: str, channel: str, seed: int) -> RssResult:
     rng = np.random.default_rng(seed)
     position, (east, north, up) = track.position_m, track.position_m.T
     t = site.towers[tower].position_m
@@ -87,7 +87,7 @@ def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> R
     )  # fmt: skip
 
 
-def make_rank(site: Site, track: Track) -> RankResult:
+def make_rank(site: Site, track: DrawnTrack) -> RankResult:
     pick = slice(0, None, 6)
     (east, north, up), time = track.position_m[pick].T, track.time[pick]
     rng = np.random.default_rng(11)
@@ -105,7 +105,7 @@ def make_rank(site: Site, track: Track) -> RankResult:
 def make_report() -> ReportData:
     site, track = make_site(), make_track()
     waypoints = tuple(
-        Waypoint(label=c, time=track.time[i], east_m=track.position_m[i, 0], north_m=track.position_m[i, 1])
+        DrawnPoint(label=c, time=track.time[i], east_m=track.position_m[i, 0], north_m=track.position_m[i, 1])
         for c, i in zip("ABCDEF", (480, 1700, 2560, 3420, 4280, 5500), strict=True)
     )
     rss = tuple(

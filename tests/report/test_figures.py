@@ -14,7 +14,7 @@ from aerpaw_cmp.compare.result import RankResult, RssResult
 from aerpaw_cmp.report import canvas
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report import flight_figures as figures
-from aerpaw_cmp.report.flight_data import ReportData, Track, start_of, used_towers
+from aerpaw_cmp.report.flight_data import DrawnTrack, ReportData, start_of, used_towers
 from aerpaw_cmp.site.siteyaml import load_site
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
 
@@ -117,7 +117,7 @@ def few_thresholds(panel: RankResult, most: int) -> RankResult:
     return with_numbers(panel, rank={k: panel.rank[k] for k in thresholds}, simulated=simulated)
 
 
-def still(track: Track) -> Track:
+def still(track: DrawnTrack) -> DrawnTrack:
     return dataclasses.replace(track, position_m=np.tile([5.0, 5.0, 0.5], (len(track.time), 1)))
 
 
@@ -137,7 +137,7 @@ def drawn_before():
         lambda d: {"rss": (), "rank": (few_thresholds(d.rank[0], 0),)},
         lambda d: {"rss": (), "rank": (few_thresholds(d.rank[0], 1),)},
         lambda d: {"rss": (), "rank": (), "track": still(d.track)},
-        lambda d: {"rss": (), "rank": (), "track": Track(time=d.track.time[:1], position_m=d.track.position_m[:1])},
+        lambda d: {"rss": (), "rank": (), "track": DrawnTrack(time=d.track.time[:1], position_m=d.track.position_m[:1])},
         lambda d: {"rss": (), "rank": (), "track": dataclasses.replace(d.track, position_m=d.track.position_m * [1.0, 1.0, np.nan])},
         lambda d: {"rss": (), "rank": (), "site": dataclasses.replace(d.site, towers={}, buildings=(), forests=(), geofences=(), trees=type(d.site.trees).none())},
     ],

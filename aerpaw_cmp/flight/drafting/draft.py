@@ -167,7 +167,7 @@ def draft(
     files: Sequence[IngestedFile],
     folder: Path,
     options: DraftOptions = DraftOptions(),
-    flight: NamedFlight | None = None,
+    flight: LoggedFlight | None = None,
 ) -> tuple[str, list[str]]:
     """Return the text of a flight.yaml for logs, and remarks about it.
 
@@ -178,7 +178,7 @@ def draft(
     folder : Path
         Folder of the flight.yaml. Paths in the text are relative to it.
     options : DraftOptions
-    flight : NamedFlight, optional
+    flight : LoggedFlight, optional
         The flight of the files. By default all files belong to one flight.
 
     Returns
@@ -331,7 +331,7 @@ def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NamedFlight:
+class LoggedFlight:
     """A flight that can be drafted.
 
     Parameters
@@ -351,12 +351,12 @@ class NamedFlight:
     unsure: Mapping[str, str]
 
 
-def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, NamedFlight]:
+def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, LoggedFlight]:
     """Return the flights that can be drafted, by name, in the order of time."""
     every = [flight for flight in flights(files) if flight.measured]
     # if no flight has a track, all are drafted
     complete = [flight for flight in every if flight.complete] or every
-    named: dict[str, NamedFlight] = {}
+    named: dict[str, LoggedFlight] = {}
     for flight in complete or [Flight(list(files))]:
         name = _name(_flown(flight.files), flight.files)
         # two flights started in the same minute, or the folder has no times
@@ -364,7 +364,7 @@ def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, NamedFlight]:
         name = f"{name}_{taken + 1}" if taken else name
         # if one flight is complete, its draft lists all other logs as not used
         inside = flight.files if len(complete) > 1 else list(files)
-        named[name] = NamedFlight(name=name, files=inside, own=flight.files, unsure=flight.unsure)
+        named[name] = LoggedFlight(name=name, files=inside, own=flight.files, unsure=flight.unsure)
     return named
 
 

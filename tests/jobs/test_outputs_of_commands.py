@@ -87,6 +87,9 @@ def test_site_import_never_replaces_the_map(tmp_path: Path, capsys: pytest.Captu
 def test_simulate_replaces_its_own_folder_only(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With real logs in the flight's folder, a folder of simulated logs is a flight that a report accepts."""
     out = logs.parent / "out"
+    content = yaml.safe_load((logs / "flight.yaml").read_text())
+    del content["flight"]["plan"]["waypoints"][2:]  # 20 s of flight
+    (logs / "flight.yaml").write_text(yaml.safe_dump(content))
     assert "contains an input" in refused(capsys, logs, "simulate", logs / "flight.yaml", "-o", logs)
     shutil.copytree(logs / "UAV", out / "UAV")
     said = refused(capsys, out, "simulate", logs / "flight.yaml", "-o", out, "--force")

@@ -117,6 +117,12 @@ def test_a_message_says_what_was_found_what_is_expected_and_what_to_type(kind: s
     assert len(text.splitlines()[0]) < 420
 
 
+def test_a_wrong_port_of_the_tap_sends_to_the_doctor() -> None:
+    for port in ("/dev/null", "/dev/ttyNOTHING", "notes.txt"):
+        assert said(f"tap {port} --duration 1 -o log")[1].endswith("Next: 'aerpaw-cmp doctor' lists the serial ports")
+    assert "ri_hz is 1e+09; expected a positive number below 1e6" in said("tap log --ri-hz 1e9 --duration 1")[1]
+
+
 def test_every_message_stands_in_the_page() -> None:
     """The page lists the first commands that are tried, kind by kind."""
     listed = re.findall(r"^\| `(.*?)` \| \d", PAGE.read_text(encoding="utf-8"), re.MULTILINE)

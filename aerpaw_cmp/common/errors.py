@@ -353,6 +353,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     in_file = place is None or "timezone:" in (error.expected or "")
     if in_file and settings_file and words[:1] in _OF_SETTINGS and "--" not in error.found:
         return f"fix {one_line(Path(settings_file).name)} and run the same command"
+    if words[:1] == ["tap"] and isinstance(error, InputError):
+        return "'aerpaw-cmp doctor' lists the serial ports"
     if place is None or not isinstance(error, InputError):
         return f"'{command} --help' lists the options"
     if not _exists(place):
@@ -360,7 +362,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if str(place) in (last for option, last in pairwise(arguments) if option == "--against"):
         return f"correct {one_line(place.name)} (docs/referee.md lists the columns) and run the same command"
     if not place.is_file():
-        return f"'ls {one_line(str(place))}' shows what the folder contains"
+        return f"'ls -l {one_line(str(place))}' shows what is there"
     if words[:1] == ["ingest"]:
         # a recognised file, or a hint about columns, already contains the next step
         unknown = "no reader recognises" in error.found and "--map" not in (error.cause or "")

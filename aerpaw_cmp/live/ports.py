@@ -393,7 +393,7 @@ class TapSettings:
             value = getattr(self, name)
             # this form of the test also refuses NaN
             if value is not None and not 0 < value < 1e6:
-                raise UsageError(f"{name} is {value}", expected="a positive number")
+                raise UsageError(f"{name} is {value:g}", expected="a positive number below 1e6")
 
 
 @dataclass(frozen=True, slots=True)

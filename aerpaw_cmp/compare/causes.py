@@ -120,7 +120,9 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             if any(either <= pair for pair in named):
                 continue
             lead = _lead(either, odds) / len(showing)
-            if all(_explains(other, showing, lead, beside - either) for other in either):
+            # an almost certain cause may leave an error without a certain name, so judge it beside that error as well
+            apart = (beside, best) if lead >= _CERTAIN else (beside,)
+            if any(all(_explains(other, showing, lead, rest - either) for other in either) for rest in apart):
                 named[either] = showing
         rejected = certain - frozenset().union(*named)
         if not rejected:
@@ -913,8 +915,10 @@ _CONTROLS_S = (10.0, 20.0, 40.0)
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
-        # the report counts these samples in a caution, and its first sentence already has the error with the floor
-        yield Trial(name="lock", clipped=lost, sentence="the receiver had no lock in parts of the flight")
+        # the report counts these samples in a caution, and its first sentence already has the error with the floor; the
+        # log itself shows this fault, so it does not pay for being rare
+        sentence = "the receiver had no lock in parts of the flight"
+        yield Trial(name="lock", cost=-_SELDOM, clipped=lost, sentence=sentence)
 
 
 def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
@@ -1064,7 +1068,8 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
 def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatArray:
     """Return the share (m, n) of the loss of each sector (middle and width [deg]) that each sample has."""
     middle, width = (np.array(column)[:, None] for column in zip(*sectors, strict=True))
-    off = np.abs(wrap_degrees(e.tower_azimuth_deg - middle))
+    middles, of = np.unique(middle, return_inverse=True)  # sectors of several widths have the same middle
+    off = np.abs(wrap_degrees(e.tower_azimuth_deg - middles[:, None]))[of.ravel()]
     return np.asarray(np.clip(0.5 + (0.5 * width - off) / _EDGE_DEG, 0.0, 1.0))
 
 

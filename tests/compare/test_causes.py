@@ -744,6 +744,15 @@ def test_each_of_two_causes_is_judged_by_the_error_that_the_other_leaves() -> No
     assert _named(replace(sound, measured_db=sound.measured_db + change)) == "tower"
 
 
+@pytest.mark.parametrize(("number", "faults", "name"), [
+    (145, ("saturation", "clock"), "saturation"),
+    (225, ("lock",), "lock"),
+])  # fmt: skip
+def test_a_certain_cause_and_a_logged_loss_of_lock_are_named(number: int, faults: tuple[str, ...], name: str) -> None:
+    """A ceiling is certain although three causes may explain the rest, and a log can show a loss of lock itself."""
+    assert _named(situation(faults, np.random.default_rng([1, number]))[0]) == name
+
+
 @pytest.mark.parametrize(("swapped_db", "other_db", "alike"), [(5.0, 2.0, 1.0), (3.5, 5.0, 0.0)])
 def test_a_cause_that_may_not_be_named_takes_no_credit(
     monkeypatch: pytest.MonkeyPatch, swapped_db: float, other_db: float, alike: float

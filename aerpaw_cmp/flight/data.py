@@ -399,9 +399,15 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     for log in settings.logs:
         # report a missing log before the logs above it are read for minutes
         named_log(root, log.path)
+    # a table may have several lines, each of which reads some of its columns
+    columns = {(log.path, name) for log in settings.logs for name in log.columns.values()}
+    elsewhere = {log.path: {name for path, name in columns if path == log.path} for log in settings.logs}
+    options = (
+        dataclasses.replace(log.options(settings.timezone), read_elsewhere=elsewhere[log.path]) for log in settings.logs
+    )
     return tuple(
-        read_log(root, log.path, log.options(settings.timezone), reader=log.reader_name, held=cache)
-        for log in settings.logs
+        read_log(root, log.path, of_log, reader=log.reader_name, held=cache)
+        for log, of_log in zip(settings.logs, options, strict=True)
     )
 
 

@@ -13,7 +13,7 @@ Values in flight.yaml count as written. ``ingest --draft`` asks about assumed va
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -51,6 +51,8 @@ class ReadOptions:
         Number that the source prints for rank 1. Readers of formats with a fixed base ignore it.
     columns : mapping, optional
         Name of the file column for each record column, only for generic CSV.
+    read_elsewhere : collection of str
+        Columns of the same file that the user reads with other options, which need no warning.
     kind : str, optional
         Generic CSV only.
     node, channel : str, optional
@@ -79,6 +81,7 @@ class ReadOptions:
     gps_rollovers: int = 0
     ri_base: Literal["zero", "one"] | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
+    read_elsewhere: Collection[str] = ()
     kind: Kind | None = None
     node: str | None = None
     channel: str | None = None

@@ -170,6 +170,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             streams.append(_stream(part, cells, kind, where, words, options.unit or unit, of_part))
         if kind == "rss":
             streams.append(_track(of_device, table, where, device, (heights, about)))
+    sheet.used |= {i for i, name in enumerate(header) if name in options.read_elsewhere}
     rows.warnings += sheet.remarks()
     return rows.result(streams)
 

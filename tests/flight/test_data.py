@@ -164,18 +164,19 @@ def test_levels_of_another_carrier_than_that_of_their_replay_are_told(tmp_path: 
 def test_a_table_is_listed_once_per_column_of_levels(tmp_path: Path) -> None:
     """The content of the table would choose another reader, which reads positions only."""
     rows = (f"2025-06-01T10:00:{s:02}Z,{35.7275 + 1e-5 * s:.5f},-78.696,{4 * s},{-70 - s},{-80 - s}" for s in range(60))
-    (tmp_path / "t.csv").write_text("\n".join(["Zeit,Lat,Lon,Alt,Ant A,Ant B", *rows]))
+    (tmp_path / "t.csv").write_text("\n".join(["Zeit,Lat,Lon,Alt,Power A [dBm],Power B [dBm]", *rows]))
     pose = (
         "{path: t.csv, kind: telemetry, columns: {time: Zeit, latitude_deg: Lat, longitude_deg: Lon, altitude_m: Alt}}"
     )
     levels = (
-        f"{{path: t.csv, kind: rss, columns: {{time: Zeit, rss_db: Ant {column}}}, unit: dBm, node: {node}}}"
+        f"{{path: t.csv, kind: rss, columns: {{time: Zeit, rss_db: 'Power {column} [dBm]'}}, unit: dBm, node: {node}}}"
         for column, node in (("A", "LW1"), ("B", "LW2"))
     )
     text = f"flight: f\nsite: lake_wheeler\ntimezone: UTC\nlogs: [{', '.join([pose, *levels])}]\n"
     (tmp_path / "flight.yaml").write_text(text)
     flight = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path)
     assert {series.tower: series.measured_db[0] for series in flight.rss} == {"LW1": -70.0, "LW2": -80.0}
+    assert not any("not read" in text for text in flight.warnings)
 
 
 def test_the_site_lies_by_the_flight_file_and_the_logs_elsewhere(tmp_path: Path) -> None:

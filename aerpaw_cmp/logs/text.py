@@ -317,7 +317,6 @@ COUNTS = {
 }
 
 _BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock
-_MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
 
 
 @dataclass(frozen=True)
@@ -512,14 +511,12 @@ def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     year = digit[0] * 1000 + digit[1] * 100 + digit[2] * 10 + digit[3]
     month, day, hour, minute = (digit[i] * 10 + digit[i + 1] for i in (4, 6, 8, 10))
     inside = np.clip(month, 1, 12)
-    leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
-    days = _MONTH_DAYS[inside] - ((inside == 2) & ~leap)
-    # datetime64[ns] spans 1678-2262; a clock outside 1970-2261 has not been set
-    valid &= (year >= 1970) & (year <= 2261) & (month == inside) & (day >= 1) & (day <= days)
-    valid &= (hour < 24) & (minute < 60)
     months = (year.astype(np.int64) - 1970) * 12 + inside - 1
-    date = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1
-    wall = (date * 86_400 + hour * 3600 + minute * 60) * 1_000_000_000
+    first, after = ((months + i).astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) for i in (0, 1))
+    # datetime64[ns] spans 1678-2262; a clock outside 1970-2261 has not been set
+    valid &= (year >= 1970) & (year <= 2261) & (month == inside) & (day >= 1) & (day <= after - first)
+    valid &= (hour < 24) & (minute < 60)
+    wall = ((first + day - 1) * 86_400 + hour * 3600 + minute * 60) * 1_000_000_000
     return np.where(valid, wall, 0), valid
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.readers import FloatArray, IntArray, Lines, RejectedLine, dictionary
+from aerpaw_cmp.readers import FloatArray, IntArray, Lines, RejectedLine, dictionary, mostly
 
 _MOST_LINES = 5000
 # Largest total size [bytes] of incomplete objects that are tried over several lines, as a limit on time.
@@ -102,6 +102,20 @@ def _several(lines: Lines, first: int) -> tuple[Any, int]:
         return None, first
     whole = not text[length:].split("\n", 1)[0].strip(" \t\r,]")
     return (value, first + text.count("\n", 0, length)) if whole else (None, first)
+
+
+# A name and a value, and a line of such pairs.
+_PAIR = r'([A-Za-z_][\w.-]{0,40})=("[^"\n]{0,200}"|[^\s"=,;]{0,80})'
+_PAIRS = re.compile(rf"\s{{0,40}}{_PAIR}(?:[\s,;]{{1,4}}{_PAIR}){{2,60}}\s*$".encode())
+
+
+def from_pairs(data: bytes) -> bytes:
+    """Return lines of logfmt, such as ``time=... pci=12 rsrp=-83``, as lines of objects, and other data unchanged."""
+    if not mostly(data, _PAIRS):
+        return data
+    lines = [dict(re.findall(_PAIR, line)) for line in data.decode("utf-8", "replace").split("\n")]
+    texts = (json.dumps({name: text.strip('"') for name, text in line.items()}) if line else "" for line in lines)
+    return "\n".join(texts).encode()
 
 
 # The beginning of a file of objects, or of an array of objects.

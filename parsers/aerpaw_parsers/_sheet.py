@@ -89,7 +89,8 @@ def _is_even(lines: Sequence[bytes], separator: str) -> bool:
 
 def starts(head: bytes, is_header: _IsHeader) -> bool:
     """Check whether a file begins with a header of this kind, perhaps below title lines, and with rows of its width."""
-    if _json.BEGIN.match(head):  # JSON lines: the names of the values in the first object are the header
+    # the header of JSON lines consists of the names of the values in the first objects
+    if _json.BEGIN.match(head := _json.from_pairs(head)):
         entries = [] if _OF_PROGRAMS.search(head) else _json.beginning(head)
         return bool(entries) and is_header([*{name: "" for entry in entries for name in _json.readings(entry)[0]}])
     lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
@@ -521,7 +522,7 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet:
     InputError
         If none of the first lines is a header.
     """
-    if _json.BEGIN.match(data):
+    if _json.BEGIN.match(data := _json.from_pairs(data)):
         lines = _text.split(data)
         parsed = _json.objects(lines)
         entries = zip(parsed.row.tolist(), parsed.values, strict=True)

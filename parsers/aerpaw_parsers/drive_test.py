@@ -400,9 +400,8 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
 def _keys(sheet: _sheet.Sheet, column: int) -> list[str]:
     """Return the quantities that divide the levels of a column, among them the radio access if there are several."""
     technology = sheet.find("technology")
-    known = np.isfinite(sheet.numbers(column)).tolist()
-    rats = set() if technology is None else {_rat(text) for text in compress(sheet.texts(technology), known)}
-    return ["PCI", "ARFCN", *(["technology"] if len(rats) > 1 else [])]
+    texts = () if technology is None else compress(sheet.texts(technology), np.isfinite(sheet.numbers(column)))
+    return ["PCI", "ARFCN", *(["technology"] if len({*map(_rat, texts)}) > 1 else [])]
 
 
 def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:

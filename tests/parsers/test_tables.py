@@ -544,3 +544,24 @@ def test_a_mean_of_ranks_next_to_a_rank_is_a_kpi(name: str) -> None:
 def test_what_the_reader_cannot_know_is_said(text: str, word: str) -> None:
     reader = "drive_test" if "rsrp" in text else "pose_csv"
     assert any(word in warning for warning in read(reader, text.encode()).warnings)
+
+
+def test_logfmt_is_a_table_in_any_order_of_names() -> None:
+    names = ["ts", "msg", "pci", "rsrp", "lat", "lon"]
+    lines = [
+        f'ts=2025-03-02T15:00:{i:02d}Z msg="a b" pci={11 + i % 2} rsrp={-80 - 9 * (i % 2)} lat=35.{7000 + i} lon=-78.7'
+        for i in range(20)
+    ]
+    turned = [
+        " ".join(sorted(line.replace("a b", "ab").split(), key=lambda pair: names.index(pair.split("=")[0]) % 4))
+        for line in lines
+    ]
+    for listed in (lines, turned):
+        data = ("\n".join([*listed[:10], "restarted", *listed[10:]]) + "\n").encode()
+        assert by_name("drive_test").sniff(data)
+        result = read("drive_test", data)
+        assert (result.accepted, result.blank, len(result.rejected)) == (20, 1, 0)
+        assert {s.attributes["pci"]: set(s.frame["rss_db"]) for s in result.streams if s.kind == "rss"} == {
+            11: {-80},
+            12: {-89},
+        }

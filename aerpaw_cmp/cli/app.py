@@ -18,7 +18,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
 from typer import Option
@@ -59,6 +59,10 @@ Flights = Annotated[
         metavar="FLIGHT",
         help="flight.yaml of a flight to learn from, or a calibration.yaml that lists flights; repeatable.",
     ),
+]
+Figures = Annotated[
+    Literal["none", "svg", "png", "pdf", "all"],
+    Option(help="Format of figures as separate files: none, one format, or all formats."),
 ]
 DryRun = Annotated[bool, Option("--dry-run", help="Check all inputs, print the stages, and write no files.")]
 Quiet = Annotated[bool, Option("-q", "--quiet", help="Print only results, warnings and failures.")]

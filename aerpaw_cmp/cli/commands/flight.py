@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
 from ...common.text import counted
 from ...jobs.options import AGAINST_DISTANCE_M, RunOptions
-from ..app import DryRun, Force, LogsRoot, command, output
+from ..app import DryRun, Figures, Force, LogsRoot, command, output
 from ..shown import answered, number, print_files, records, say, show, table, warn_all
 
 
@@ -52,10 +52,7 @@ def report(
         float, Option(min=0.01, help="Largest distance from a sample to a predicted position [m].")
     ] = AGAINST_DISTANCE_M,
     strict: Annotated[bool, Option("--strict", help="End with exit code 1 if a check failed.")] = False,
-    figures: Annotated[
-        Literal["none", "svg", "png", "pdf", "all"],
-        Option(help="Format of figures as separate files: none, one format, or all formats."),
-    ] = "none",
+    figures: Figures = "none",
     kmz: Annotated[bool, Option("--kmz", help="Also write samples.kmz for Google Earth and QGIS.")] = False,
     netcdf: Annotated[bool, Option("--netcdf", help="Also write rss.nc and rank.nc for xarray and MATLAB.")] = False,
     dry_run: DryRun = False,

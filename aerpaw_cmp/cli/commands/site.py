@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from ...common.errors import UsageError
 from ...jobs.options import RunOptions
-from ..app import DryRun, Flights, Force, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
+from ..app import DryRun, Figures, Flights, Force, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
 from ..shown import answered, print_files, records, say, show, table, warn_all
 
 
@@ -199,10 +199,7 @@ def map_(
         float | None,
         Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
     ] = None,
-    figures: Annotated[
-        Literal["none", "png", "svg", "pdf", "all"],
-        Option(help="Format of figures as separate files: none, one format, or all formats."),
-    ] = "none",
+    figures: Figures = "none",
     workers: Workers = 1,
     scheduler: Scheduler = None,
     dry_run: DryRun = False,

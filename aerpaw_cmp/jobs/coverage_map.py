@@ -220,9 +220,7 @@ class SiteChannels:
     def of(self, mode: str) -> grids.Evaluate:
         """Return the evaluation of one foliage mode."""
 
-        def evaluate(position_m: units.FloatArray, towers: tuple[str, ...]) -> grids.Evaluation:
-            if towers != self.names:
-                raise ValueError(f"towers {towers} are not those of the site")
+        def evaluate(position_m: units.FloatArray) -> grids.Evaluation:
             chunk = position_m.tobytes()
             if (mode, chunk) not in self._ready:
                 self._ready |= {(name, chunk): evaluated for name, evaluated in self._all_modes(position_m).items()}
@@ -504,7 +502,7 @@ def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[
     """Return the stages of a map for its dry run. One position is mapped, so that errors of the map appear."""
     grid = Grid.over_area(place.area_m, settings.spacing_m)
     first_m = np.append(grid.points_m[0, :2], min(settings.rss_altitudes_m, default=30.0))
-    SiteChannels(place, settings).of(settings.shown)(first_m[None], tuple(place.towers))
+    SiteChannels(place, settings).of(settings.shown)(first_m[None])
     heights, tile = {*settings.rss_altitudes_m, *settings.rank_altitudes_m}, settings.tile_cells(grid)
     sides = {"position": len(grid), "height": len(heights), "tower": len(place.towers)}
     work = f"{counted(math.prod(sides.values()), 'link')}: {', '.join(counted(n, name) for name, n in sides.items())}"

@@ -365,17 +365,10 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     -------
     Score
 
-    Raises
-    ------
-    UsageError
-        If the side is not positive.
-
     Notes
     -----
     Spatially blocked cross-validation (Roberts et al. 2017, doi:10.1111/ecog.02881).
     """
-    if not block_m > 0:
-        raise UsageError(f"blocks of {block_m} m", expected="a positive length")
     points = unmasked(points_m)
     # a position on the border of blocks must not change its block by rounding
     cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)

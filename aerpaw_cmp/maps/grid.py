@@ -6,7 +6,7 @@ Each position is the centre of its cell: 1080 m x 2130 m at 30 m contains 36 x 7
 
 The replay engine is passed as a function, so that this module does not depend on an engine::
 
-    evaluate(position_m (n, 3), tower_names) -> Evaluation
+    evaluate(position_m (n, 3)) -> Evaluation
 
 The function is called for one altitude and at most ``chunk`` positions at a time, so only the result grows with the
 number of altitudes. It has 24 bytes of levels, 16 bytes of singular-value ratios, and 1 byte of rank per K, for each
@@ -323,7 +323,7 @@ class Evaluation:
         return self.rss_siso_dbm, self.rss_mimo_dbm, self.level_sd_db
 
 
-Evaluate = Callable[[FloatArray, tuple[str, ...]], Evaluation]
+Evaluate = Callable[[FloatArray], Evaluation]
 
 
 @dataclass(frozen=True, slots=True)
@@ -444,7 +444,7 @@ def map_job(
         positions = grid.positions_m(height)
         for start in range(0, n, chunk):
             part = slice(start, min(start + chunk, n))
-            evaluated = evaluate(positions[part], names)
+            evaluated = evaluate(positions[part])
             if height in at["rss"]:
                 row = at["rss"].index(height)
                 rss[:, row, :, part] = np.stack(evaluated.levels).swapaxes(1, 2)

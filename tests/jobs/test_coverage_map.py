@@ -78,7 +78,7 @@ def test_every_mode_is_what_a_replay_with_its_loss_says(site):
         link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
         single = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
         expected, siso = (replay(site, wanted, poses, field=Field(loss=loss)) for wanted in (link, single))
-        mapped = maps[mode] = channels.of(mode)(position, ("A", "B"))
+        mapped = maps[mode] = channels.of(mode)(position)
         np.testing.assert_allclose(mapped.rss_siso_dbm, siso.rss_dbm, atol=1e-9)
         for k in (10.0, 1000.0):
             rank = channel_rank(expected.h, k)
@@ -99,7 +99,7 @@ def test_a_broadside_beam_gains_the_number_of_elements():
     site = Site("air", SiteFrame(35.7, -78.7), {"A": tower("A", 0.0, 0.0)})
     channels = coverage_map.SiteChannels(site, settings(max_depth=0, foliage=("none",)))
     places = np.array([[3000.0, 0.0, 10.0], [0.0, 3000.0, 10.0]])
-    channels_there = channels.of("none")(places, ("A",))
+    channels_there = channels.of("none")(places)
     gain = channels_there.rss_mimo_dbm[:, 0] - channels_there.rss_siso_dbm[:, 0]
     assert gain[0] == pytest.approx(10 * np.log10(4), abs=1e-3)
     assert gain[1] < -40
@@ -118,7 +118,7 @@ def test_modes_share_one_search_and_nothing_is_kept(site):
     channels = coverage_map.SiteChannels(site, settings())
     position = np.array([[20.0, 20.0, 30.0]])
     for mode in coverage_map.FOLIAGE:
-        channels.of(mode)(position, ("A", "B"))
+        channels.of(mode)(position)
     assert not channels._ready
 
 
@@ -131,10 +131,10 @@ def test_heights_are_above_the_ground_of_the_elevation_model():
     line_of_sight = settings(max_depth=0, foliage=("none",))
     there = np.array([[500.0, 40.0, 30.0]])
     raised = there + np.array([0.0, 0.0, 5.0])  # 1 % over 500 m
-    sloping = coverage_map.SiteChannels(hilly, line_of_sight).of("none")(there, ("A",))
-    expected = coverage_map.SiteChannels(flat, line_of_sight).of("none")(raised, ("A",))
+    sloping = coverage_map.SiteChannels(hilly, line_of_sight).of("none")(there)
+    expected = coverage_map.SiteChannels(flat, line_of_sight).of("none")(raised)
     assert sloping.rss_siso_dbm[0, 0] == pytest.approx(expected.rss_siso_dbm[0, 0], abs=1e-9)
-    level = coverage_map.SiteChannels(flat, line_of_sight).of("none")(there, ("A",))
+    level = coverage_map.SiteChannels(flat, line_of_sight).of("none")(there)
     assert abs(sloping.rss_siso_dbm[0, 0] - level.rss_siso_dbm[0, 0]) > 1e-4
 
 

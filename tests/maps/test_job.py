@@ -30,9 +30,9 @@ class Engine:
         self.range_m, self.extra_loss_db = range_m, extra_loss_db
         self.calls = []
 
-    def __call__(self, position_m, names):
+    def __call__(self, position_m):
         self.calls.append((len(position_m), float(position_m[0, 2])))
-        towers = np.array([TOWERS[name] for name in names])
+        towers = np.array(list(TOWERS.values()))
         d = np.linalg.norm(position_m[:, None] - towers[None], axis=-1)
         seen = d < self.range_m
         siso = np.where(seen, -40.0 - 20 * np.log10(d) - self.extra_loss_db, np.nan)
@@ -61,10 +61,10 @@ def test_each_altitude_is_evaluated_once_in_chunks():
 
 
 def test_values_land_where_they_belong(result):
-    direct = Engine()(GRID.positions_m(70.0), ("A", "B"))
+    direct = Engine()(GRID.positions_m(70.0))
     np.testing.assert_array_equal(result.rss("siso", "B")[1], direct.rss_siso_dbm[:, 1])
     np.testing.assert_array_equal(result.rss("mimo", "A")[1], direct.rss_mimo_dbm[:, 0])
-    direct = Engine()(GRID.positions_m(40.0), ("A", "B"))
+    direct = Engine()(GRID.positions_m(40.0))
     np.testing.assert_array_equal(
         result.ranks("B")[2], rank_of_singular_values(direct.singular_values, (10, 100))[:, 1].T
     )
@@ -161,8 +161,8 @@ def test_rank_study_runs_the_papers_comparison(result):
 
 
 def test_rank_study_of_a_flat_map_says_so():
-    def flat(position_m, names):
-        ones = np.ones((len(position_m), len(names)))
+    def flat(position_m):
+        ones = np.ones((len(position_m), len(TOWERS)))
         return Evaluation(-ones, -ones, 0 * ones, np.stack([ones, 0 * ones, 0 * ones, 0 * ones], axis=-1))
 
     made = map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40))

@@ -158,18 +158,22 @@ def test_all_out_of_coverage_has_no_numbers_but_counts(tmp_path: Path, capsys: p
     assert main(["report", str(path), "-o", str(tmp_path / "out"), "--strict"]) == 1
 
 
-def test_one_sample_fits_itself_and_claims_no_interval(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = flight(tmp_path, rss={"USRP1": ([20.0], [-70.0])})
+@pytest.mark.parametrize("levels", [[-70.0], [-70.0, -72.0]])
+def test_one_or_two_samples_have_no_error(
+    levels: list[float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An offset fits one sample exactly, and two samples always have a correlation of 1 or -1."""
+    path = flight(tmp_path, rss={"USRP1": ([20.0, 25.0][: len(levels)], levels)})
     (series,) = compared_rss(path)
-    assert series.score.n == 1
-    assert series.score.rmse_db <= 0.05 + 1e-9
-    assert np.isnan(series.score.correlation)
-    assert not np.isfinite(series.score.rmse_ci95_db).any()
-    assert report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]["correlation"] is None
+    assert series.score.n == len(levels)
+    assert np.isnan([series.score.rmse_db, series.score.correlation, *series.score.rmse_ci95_db]).all()
+    channel = report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]
+    assert channel["correlation"] is channel["rmse_db"] is channel["baselines"]["free_space"]["rmse_db"] is None
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Nothing could be compared: no channel has 20 samples" in page
+    assert f"nothing to score. {len(levels)} of " in page
     assert main(["report", str(path), "-o", str(tmp_path / "again")]) == 1
-    assert "1 sample with measurement, pose and path; expected 20" in capsys.readouterr().err
+    assert " with measurement, pose and path; expected 20" in capsys.readouterr().err
 
 
 def test_one_wild_sample_is_flagged_kept_and_said_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

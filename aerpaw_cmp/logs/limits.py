@@ -315,7 +315,7 @@ _MOST_DBM = {"RSRP": -20.0}
 # A lost reading is within the first limit of 0 dB or of a placeholder, and farther than the second from all other
 # levels. The third is the largest share of lost readings. No path gains 20 dB from one reading to the next and loses it
 # again.
-_LOST_DB, _FAR_DB, _LOST_SHARE = 1.0, 20.0, 0.2
+_LOST_DB, _FAR_DB, _LOST_SHARE, _CUT_DB = 1.0, 20.0, 0.2, 15.0
 # Lowest values of phones, modems and 8-bit integers, which programs write for a missing reading.
 _LEAST_DB = (-127.0, -128.0, -140.0, -141.0, -150.0, -156.0, -157.0)
 # Levels of two devices alternate from record to record: they differ by more than fading, and return with the next
@@ -448,11 +448,10 @@ class _Check:
     def _lost_readings(self) -> None:
         """Flag a few placeholders far from all other levels, which programs write for lost readings."""
         level = self._values("rss_db")
-        cut = (self.frame["flag"] == UNTERMINATED).to_numpy()  # -92 may have become -9
+        # -92 at the end of a file may have become -9, -127 may have become -12
+        most = np.where(self.frame["flag"] == UNTERMINATED, _CUT_DB, _LOST_DB)
         # -1 is also a common placeholder
-        for lost, sign, word in (
-            (np.abs(level) <= _LOST_DB, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below"), (cut, 1, "above")
-        ):  # fmt: skip
+        for lost, sign, word in ((np.abs(level) <= most, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):
             known = np.isfinite(level).sum()
             if not lost.any() or lost.sum() > max(1, _LOST_SHARE * known) or known < _FEW_ROWS:
                 continue

@@ -152,11 +152,12 @@ def _is_divided(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
     return max(values.values(), default=0) > 1
 
 
-def cell_columns(sheet: _sheet.Sheet) -> list[int]:
-    """Return the columns that are named like a cell and that the dictionary does not know."""
-    return [
+def cell_columns(sheet: _sheet.Sheet, *, nr: bool | None = None) -> list[int]:
+    """Return the columns that are named like a cell and that the dictionary does not know, if possible of NR or not."""
+    columns = [
         i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and dictionary.names_a_cell(words, alone=True)
     ]
+    return [i for i in columns if (dictionary.PATTERNS["nr"].search(sheet.plain[i]) is not None) is nr] or columns
 
 
 def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int], level: int | None) -> list[int]:
@@ -301,7 +302,7 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
 _FLOAT = re.compile(r"^(\d+)\.0+$")
 
 
-def cell_names(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[str, dict[str, Attribute]]]:
+def cell_names(sheet: _sheet.Sheet, base: Sequence[str], nr: bool) -> tuple[list[str], dict[str, dict[str, Attribute]]]:
     """Return a name per row that distinguishes cells of one PCI and carrier, and the attributes of each name.
 
     Parameters
@@ -309,8 +310,10 @@ def cell_names(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dic
     sheet : Sheet
     base : sequence of str, length n
         PCI and carrier of each row.
+    nr : bool
+        Whether the names are those of NR cells.
     """
-    texts = {i: _named(sheet, i) for i in cell_columns(sheet)}
+    texts = {i: _named(sheet, i) for i in cell_columns(sheet, nr=nr)}
     chosen = dividing_columns(texts, _with_level(sheet), base)
     sheet.used |= {i for i, values in _values(texts).items() if len(values) <= _MOST_PARTS}
     about: dict[str, dict[str, Attribute]] = {}

@@ -158,8 +158,8 @@ _RAT = re.compile(r"(?i)(lte|nr|[2345]g|gsm|umts|wcdma|e-?utran?)([ _-]?(a|nr|ns
 _ANY_RAT = re.compile(r"(?i)lte|nr|^\s*\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|neigh|serv|detect|^\s*$")
 # Names of cells and satellites in columns that usually contain a state or a count.
 _A_CELL = re.compile(r"(?i)(?!\s*([01](\.0)?|[ps]?cell ?\d*)\s*$).*\d")
-_NAMES_IN = {"serving": _A_CELL, "neighbouring": _A_CELL, "satellites": re.compile(r"\s*[^\W\d_]\w*[- ]?\d")}
 _NETWORK = dictionary.meaning("gateway")
+_NAMES_IN = {"serving": _A_CELL, "neighbouring": _A_CELL, "satellites": re.compile(r"\s*[^\W\d_]\w*[- ]?\d")}
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that need no conversion.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
@@ -491,7 +491,7 @@ class Sheet:
         return bool(few and levels and self.find("PCI") is None)
 
 
-_CALLED = re.compile(r"\b(id|unit|cc|chain|scell|no|num(ber)?)\b")
+_CALLED = re.compile(r"id\b|\b(unit|cc|chain|scell|no|num(ber)?)\b")
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
 _ASU = re.compile(r"\basu\b")
 # Gains of a receiver, not those of an antenna or a transmitter.

@@ -14,7 +14,7 @@ several towers, ``time,snr_lw1,snr_lw2,...``.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import compress
@@ -216,7 +216,7 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
 
 
 def _readings(
-    sheet: _sheet.Sheet, cells: list[_Cell], more: list[str], known: dict[str, dict[str, Attribute]]
+    sheet: _sheet.Sheet, cells: list[_Cell], more: Sequence[list[str]], known: dict[str, dict[str, Attribute]]
 ) -> pd.DataFrame:
     technology = sheet.find("technology")
     of_row = np.array([] if technology is None else [_rat(text) for text in sheet.texts(technology)], dtype=object)
@@ -230,7 +230,8 @@ def _readings(
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {
             "row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle,
-            "more": more if cell.place == "serving" else "", "mark": _identity.labels(sheet, cell.marks, known),
+            "more": more[cell.rat == "nr"] if cell.place == "serving" else "",
+            "mark": _identity.labels(sheet, cell.marks, known),
             "carrier": "" if cell.place.startswith(("serving", "n")) else cell.place.replace(" ", "_"),
             "column": "" if cell.place == "serving" and not cell.marks else cell.place.replace(" ", "_"),
         }  # fmt: skip
@@ -362,7 +363,9 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     serving = next((cell.columns for cell in cells if cell.place == "serving"), {})
     identities = [sheet.texts(serving[name]) for name in _IDENTITY if name in serving]
     base = ["\t".join(row) for row in zip(*identities, strict=True)] or [""] * len(sheet)
-    more, about = _identity.cell_names(sheet, base)
+    # 'cell_id' next to 'nr_cell_id' is the identity of the LTE cell
+    more, known = zip(*(_identity.cell_names(sheet, base, nr) for nr in (False, True)), strict=True)
+    about = known[0] | known[1]
     owned: dict[tuple[str, ...], list[_Cell]] = {}
     for cell in cells:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""

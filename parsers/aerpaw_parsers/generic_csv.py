@@ -135,9 +135,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     # proposed options name columns with the unit of the line below the header
     bare = {key: name if name in header else _UNIT.sub("", name) for key, name in options.columns.items()}
     options = replace(options, columns=bare) if {*bare.values()} <= {*header} else options
-    first += at
     kind, where = _checked(options, header)
-    sheet = _sheet.cut(lines, first, separator, header)
+    sheet = _sheet.cut(lines, first + at, separator, header)
     sheet.used |= {*where.values()}
     for name in {*_NAMED} & {*where}:
         sheet.names[where.pop(name)] = name

@@ -290,3 +290,13 @@ def test_short_names_are_asked_about(name: str, values: str, tmp_path: Path) -> 
     rows = "".join(f"{1749564000 + i},{values.split()[i // 20]},{-80 - i % 7}\n" for i in range(40))
     result = read(tmp_path / "x.csv", f"time,{name},rsrp\n{rows}")
     assert any(f"'{name}'" in text for text in result.warnings) or len(result.streams) == 2
+
+
+@pytest.mark.parametrize("names", ["cell_id,rsrp,nr_cell_id,nr_pci,nr_rsrp", "nr_pci,nr_rsrp,nr_cell_id,cell_id,rsrp"])
+def test_the_number_of_an_lte_cell_does_not_divide_the_levels_of_nr(names: str, tmp_path: Path) -> None:
+    """A phone on both: one LTE handover, no NR handover. Without LTE, the number of an NR cell divides its levels."""
+    cells = {"rsrp": "-70", "nr_cell_id": "900", "nr_pci": "501", "nr_rsrp": "-95"}
+    rows = [",".join((cells | {"cell_id": str(51 + i // 20)})[name] for name in names.split(",")) for i in range(40)]
+    assert levels_by_cell(tmp_path / "x.csv", names, rows) == [[-95], [-70], [-70]]
+    rows = [f"501,{900 + i // 20},{-70 - i // 20}" for i in range(40)]
+    assert levels_by_cell(tmp_path / "x.csv", "nr_pci,nr_cell_id,nr_rsrp", rows) == [[-71], [-70]]

@@ -137,9 +137,9 @@ def compare_rss(
     order = np.flatnonzero(use)[np.argsort(time[use], kind="stable")]
     m, s = measured[order], simulated[order]
     place = None if position_m is None else position_m[order]
-    fit = grid_offset(m, s, span_db=span_db)
+    fit = _fit(m, s, span_db)
     simple = {name: _levels(levels)[order] for name, levels in (baselines or {}).items()}
-    fits = {name: grid_offset(m, level, span_db=span_db) for name, level in simple.items()}
+    fits = {name: _fit(m, level, span_db) for name, level in simple.items()}
     return RssComparison(
         offset_db=fit.offset_db,
         rmse_db=fit.rmse_db,
@@ -155,6 +155,12 @@ def compare_rss(
         baseline_intervals={name: _rmse_interval(m - level, fits[name], place) for name, level in simple.items()},
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
     )
+
+
+def _fit(measured_db: FloatArray, simulated_db: FloatArray, span_db: tuple[float, float]) -> OffsetFit:
+    # an offset fits one sample exactly, and the RMSE of two is the half of one difference
+    fit = grid_offset(measured_db, simulated_db, span_db=span_db)
+    return fit if fit.n > 2 else replace(fit, rmse_db=np.nan)
 
 
 # Entry of ``fitted_on_scored`` for antennas that were learned from the scored flight.

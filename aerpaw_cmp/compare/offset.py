@@ -147,8 +147,7 @@ def grid_offset(
     Returns
     -------
     OffsetFit
-        The best offset, to be added to the measurement. Of two equally good offsets, it is the one nearer zero. The
-        RMSE is NaN for one or two pairs, which say nothing about the error after an offset.
+        The best offset, to be added to the measurement. Of two equally good offsets, it is the one nearer zero.
 
     Raises
     ------
@@ -162,12 +161,11 @@ def grid_offset(
 
     Examples
     --------
-    >>> grid_offset([-60.0, -70.0, -80.0, float("nan")], [-57.0, -66.9, -77.0, -1.0])
-    OffsetFit(offset_db=3.0, rmse_db=0.0577..., n=3, at_edge=False)
+    >>> grid_offset([-60.0, -70.0, float("nan")], [-57.0, -66.9, -1.0])
+    OffsetFit(offset_db=3.0, rmse_db=0.0707..., n=2, at_edge=False)
     """
     grid, moments = offset_grid(step_db, span_db), difference_moments(measured_db, simulated_db)
     if not moments.n:
         return _NO_FIT
     best = nearest_offset(grid, moments.mean_db, step_db)
-    rmse_db = float(moments.rmse_db(grid[best])) if moments.n > 2 else np.nan
-    return OffsetFit(float(grid[best]), rmse_db, moments.n, best in (0, len(grid) - 1))
+    return OffsetFit(float(grid[best]), float(moments.rmse_db(grid[best])), moments.n, best in (0, len(grid) - 1))

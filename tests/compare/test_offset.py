@@ -34,8 +34,7 @@ def test_grid_search_equals_the_closed_form(pairs, shift):
     expected = closed_form(np.round(simulated - measured, 9))
     assert fit.offset_db == expected
     assert fit.at_edge == (abs(expected) == 50.0)
-    error_db = np.sqrt(np.mean((measured + fit.offset_db - simulated) ** 2)) if len(measured) > 2 else NAN
-    assert fit.rmse_db == pytest.approx(error_db, abs=1e-9, nan_ok=True)
+    assert fit.rmse_db == pytest.approx(np.sqrt(np.mean((measured + fit.offset_db - simulated) ** 2)), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -47,8 +46,8 @@ def test_a_tie_goes_to_the_offset_nearer_zero(difference, offset):
 
 def test_nan_on_both_sides_and_infinities_do_not_count():
     nan, inf = float("nan"), float("inf")
-    fit = grid_offset([-60, nan, -62, nan, -inf, -60, -60], [-50, -51, nan, nan, -50, -50, -50])
-    assert (fit.offset_db, fit.n) == (10.0, 3)
+    fit = grid_offset([-60, nan, -62, nan, -inf], [-50, -51, nan, nan, -50])
+    assert (fit.offset_db, fit.n) == (10.0, 1)
     assert fit.rmse_db == pytest.approx(0.0, abs=1e-12)
 
 
@@ -122,6 +121,6 @@ def test_the_grid_is_the_multiples_of_its_step(step, first, last):
 
 
 def test_levels_at_the_end_of_float64_have_a_huge_error_and_raise_nothing() -> None:
-    fit = grid_offset([1e308, -1e308, 0.0], [-1e308, 1e308, 0.0])
-    assert fit.n == 3
+    fit = grid_offset([1e308, -1e308], [-1e308, 1e308])
+    assert fit.n == 2
     assert fit.rmse_db > 1e100

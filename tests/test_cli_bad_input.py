@@ -157,6 +157,15 @@ def test_nan_positions_are_left_out_not_fatal(run: Run) -> None:
     assert code == 0, err
 
 
+def test_a_flight_below_the_ground_has_no_waypoints_on_its_track(run: Run) -> None:
+    """A waypoint has a time only if some position of the track after the waypoint before it is known."""
+    below = re.sub(r"35.7274,\d+", "35.7274,-80", GOOD_TELEMETRY)
+    points = ", ".join(f"{{label: {label}, east_m: 0, north_m: 0, height_m: 30}}" for label in "AB")
+    code, err = run(FLIGHT + f"report: {{waypoints: [{points}]}}\n", vehicleOut=below)
+    assert code == 1, err  # nothing was compared
+    assert "39 telemetry row(s) are below the site's ground plane" in err
+
+
 KINDS = {
     "report": FLIGHT,
     "calibrate": "calibration: a\nflights: [x.yaml]\n",

@@ -368,9 +368,9 @@ def waypoints_of(data: FlightData) -> tuple[DrawnPoint, ...]:
         return ()
     out, start, line_m = [], 0, track.position_m
     for point in points:
-        if not point.label:
-            continue
         distance = np.linalg.norm(line_m[start:] - (point.east_m, point.north_m, point.height_m), axis=1)
+        if not point.label or np.isnan(distance).all():
+            continue
         # use the first time that is within 2 m of the nearest approach, because later visits belong to later waypoints
         near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
         index = start + int(near[0])

@@ -253,6 +253,21 @@ def test_levels_are_taken_in_flight_and_their_offset_is_that_to_free_space() -> 
     assert lost.time_s.max() - time[0].astype(np.int64) * 1e-9 < 300.0
 
 
+def test_windows_whose_mean_time_is_in_a_gap_of_the_telemetry_are_ignored() -> None:
+    """Their position is the mean of known ones, but their attitude is unknown, and no position of a node would fit."""
+    finder = _node_finder()
+    row = np.arange(500)
+    gaps = finder.telemetry.frame.assign(time=finder.telemetry.frame["time"] + row // 30 * pd.Timedelta("200ms"))
+    gaps = gaps[~np.isin(row % 30, (28, 29))].reset_index(drop=True)  # 3.2 s without a position
+    finder = node.NodeFinder(SITE, Stream("telemetry", "x", gaps), [])
+    time = gaps["time"].to_numpy()
+    frame = pd.DataFrame({"time": time, "line": 1, "flag": "", "rss_db": np.linspace(-80.0, -60.0, len(time))})
+    track = finder.levels(Stream("rss", "power", frame))
+    assert len(track.level_db) == len(track.time_s) == len(track.position_m) > 100
+    assert track.rotation is not None
+    assert np.isfinite(track.rotation).all()
+
+
 def _learned_tower() -> node.LearnedTower:
     """Antennas with lobes at both ends, as if learned from flights."""
     _, _, v = sphere_grid()

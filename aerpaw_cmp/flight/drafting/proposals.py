@@ -195,7 +195,11 @@ class NodeFinder:
         track = level_track(time, place, level, floor_db=floor_db)
         if not len(track.time_s):
             return track
-        return replace(track, rotation=self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation)
+        rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
+        # the mean time of a window can be in a gap of the telemetry
+        kept = np.isfinite(rotation).all(axis=(1, 2))
+        time, place, level = track.time_s[kept], track.position_m[kept], track.level_db[kept]
+        return replace(track, time_s=time, position_m=place, level_db=level, rotation=rotation[kept])
 
     def propose(
         self,

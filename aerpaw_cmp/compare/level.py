@@ -158,7 +158,7 @@ def compare_rss(
 
 
 def _fit(measured_db: FloatArray, simulated_db: FloatArray, span_db: tuple[float, float]) -> OffsetFit:
-    # an offset fits one sample exactly, and the RMSE of two is the half of one difference
+    # an offset fits one sample exactly, and the RMSE of two is half of their difference
     fit = grid_offset(measured_db, simulated_db, span_db=span_db)
     return fit if fit.n > 2 else replace(fit, rmse_db=np.nan)
 

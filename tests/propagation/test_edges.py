@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 from shapely.geometry import Point, Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.check.explain import further_path_lines
-from aerpaw_cmp.propagation.edges import EdgePaths, Edges, diffracted, wedge_axes
+from aerpaw_cmp.propagation.edges import EdgePaths, Edges, amplitudes, diffracted, wedge_axes
 from aerpaw_cmp.propagation.geometry import Array, Link, Poses, single_element, site_faces
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import Replay, replay, trace
@@ -155,6 +156,43 @@ def test_a_link_turned_round_is_the_same() -> None:
     back = trace(place(BARN, tower=uav), LINK, poses(tower), diffraction="edges")
     assert len(bent(there)) == len(bent(back)) == 2
     assert there.h[0, 0, 0, 0] == pytest.approx(back.h[0, 0, 0, 0], rel=1e-7)
+
+
+class Cardioid:
+    """A pattern along its x axis: 1.6 in front and 0.4 behind."""
+
+    name = "cardioid"
+
+    def field(self, theta_rad: np.ndarray, phi_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        e_theta = 1.0 + 0.6 * np.sin(theta_rad) * np.cos(phi_rad) + 0j
+        return e_theta, np.zeros_like(e_theta)
+
+
+def test_patterns_multiply_paths_over_edges_by_the_gain_toward_the_edge(scenes) -> None:
+    """Both patterns have the polarisation of the isotropic element, so only the factor of the direction differs."""
+    rng = np.random.default_rng(5)
+    site = scenes.site(scenes.buildings(rng, 4, spread_m=45.0), towers=((0.0, 0.0, 9.0), (-30.0, 35.0, 14.0)))
+    spots = np.column_stack([rng.uniform(-60, 60, (6, 2)), rng.uniform(1.0, 16.0, 6)])
+    flown = scenes.poses(spots, Rotation.random(6, random_state=3).as_matrix())
+    mount = Rotation.from_euler("yz", [70.0, 25.0], degrees=True).as_matrix()
+
+    def link(second: object, uav: object) -> Link:
+        first_name, second_name = site.towers
+        towers = {first_name: single_element(), second_name: single_element(second, mount)}
+        return Link(HZ, towers, single_element(uav))
+
+    isotropic, directive = link(None, None), link(Cardioid(), Cardioid())
+    ours, scene = bent(trace(site, isotropic, flown, diffraction="edges")), Scene.of(site, isotropic, flown)
+    assert (ours.ground >= 0).any(axis=0).all()
+    assert {*ours.tower} == {0, 1}
+    plain, got = (amplitudes(ours, scene.faces, scene.sources_m, flown, of)[:, 0, 0] for of in (isotropic, directive))
+    for row, (tower, pose) in enumerate(zip(ours.tower, ours.pose, strict=True)):
+        corners = ours.vertices_m[row][np.isfinite(ours.vertices_m[row][:, 0])]
+        ends = [(corners[-1] - spots[pose], flown.rotation[pose][:, 0])]
+        if tower == 1:
+            ends.append((corners[0] - scene.sources_m[1], mount[:, 0]))
+        gain = math.prod(1.0 + 0.6 * (way @ front) / np.linalg.norm(way) for way, front in ends)
+        assert got[row] == pytest.approx(gain * plain[row], rel=1e-6)
 
 
 def test_silent_places_are_reached() -> None:

@@ -485,10 +485,10 @@ class Sheet:
             return all(_LETTER.search(text) and math.isnan(_number(text)[0]) for text in texts)
         # unlike waypoints and heights, numbers of cells are neither consecutive nor round; unlike counts, they are few
         numbers = np.unique([int(text) for text in texts])
-        like = np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any()
-        few = (like or _CALLED.search(self.plain[column])) and len(numbers) <= min(_MOST_NUMBERS, len(self) / 3)
+        called = _CALLED.search(self.plain[column])
+        like = called or (np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any() and self.find("PCI") is None)
         levels = any((what := self.meanings[i]) and what.quantity.role == "rss" for i in self.used)
-        return bool(few and levels and self.find("PCI") is None)
+        return bool(like and levels and len(numbers) <= min(_MOST_NUMBERS, len(self) / 3))
 
 
 _CALLED = re.compile(r"id\b|\b(unit|cc|chain|scell|no|num(ber)?)\b")

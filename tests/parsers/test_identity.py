@@ -140,6 +140,17 @@ def test_numbers_in_an_unknown_column_are_reported_if_they_may_be_cells(seed: in
         assert any(f"not read: '{name}'" in text for text in warnings) is asked, (numbers, warnings)
 
 
+@pytest.mark.parametrize("shared", ["", "pci"])
+@pytest.mark.parametrize("name", ["id", "unit", "cc", "SCell", "chain", "sduid"])
+def test_numbers_that_change_once_are_reported_if_the_name_may_be_that_of_a_source(
+    name: str, shared: str, tmp_path: Path
+) -> None:
+    """Two units in turn can receive one cell, so a PCI in the table does not answer the question."""
+    rows = "".join(f"{1749564000 + i},211,{1 + (i >= 30)},{-80 - i % 7}\n" for i in range(60))
+    warnings = read(tmp_path / "x.csv", f"time,{shared or 'x'},{name},rsrp\n{rows}").warnings
+    assert any(f"not read: '{name}'" in text for text in warnings), warnings
+
+
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("in_turns", [True, False])
 def test_names_in_an_unknown_column_divide_the_levels_or_are_reported(

@@ -502,12 +502,15 @@ def test_the_day_comes_first_in_europe() -> None:
     assert months == {"Europe/Paris": 4, "America/New_York": 3}
 
 
-@pytest.mark.parametrize("names", ["azimuth,elevation", "azimuth_deg,elev", "elevation_deg,x", "altitude_m,elevation"])
-def test_an_elevation_may_be_an_angle_or_the_ground(names: str) -> None:
+@pytest.mark.parametrize("names", [
+    "azimuth,elevation", "azimuth_deg,elev", "elevation_deg,x", "altitude_m,elevation", "altitude_m,cmd_alt",
+    "x,desired_alt", "rtl_alt,x", "fence altitude,x",
+])  # fmt: skip
+def test_an_angle_the_ground_or_a_wish_is_no_height(names: str) -> None:
     rows = "".join(f"2025-03-02 10:00:{i:02d},35.73,-78.7,{100 + i},{40 + i % 2}\n" for i in range(12))
     (track,) = read("pose_csv", f"time utc,lat,lon,{names}\n{rows}".encode()).streams
     heights = track.frame["altitude_m"].dropna().tolist()
-    assert [height - 100 for height in heights] == ([] if "alt" not in names else [*range(12)])
+    assert [height - 100 for height in heights] == ([] if "altitude_m" not in names else [*range(12)])
 
 
 def test_a_header_again_below_units_keeps_its_columns() -> None:
@@ -527,8 +530,8 @@ def test_the_order_of_rows_does_not_change_heights() -> None:
     assert heights[0].tolist() == heights[1].tolist()[::-1]
 
 
-@pytest.mark.parametrize("name", ["dl_ri_avg", "ri_avg"])
-def test_a_mean_of_ranks_next_to_a_rank_is_a_kpi(name: str) -> None:
+@pytest.mark.parametrize("name", ["dl_ri_avg", "ri_avg", "ri_cap", "prev_ri"])
+def test_another_rank_next_to_a_rank_is_not_reported_by_the_modem(name: str) -> None:
     data = f"time,{name},ri\n1749564000,4,2\n1749564001,4,3\n".encode()
     assert [s.frame["rank"].tolist() for s in read("drive_test", data).streams if s.kind == "rank"] == [[2, 3]]
 

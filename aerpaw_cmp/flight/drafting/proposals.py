@@ -832,7 +832,7 @@ def _odds(odds: gains.Evidence) -> str:
 
     Examples
     --------
-    >>> _odds(Evidence(over_own=4.0, over_turned=20.0))
+    >>> _odds(gains.Evidence(over_own=4.0, over_turned=20.0))
     'odds 55:1 against an unknown gain, more than 1000:1 against the same antennas rotated'
     """
     turned = "" if math.isinf(odds.over_turned) else f", {_ratio(odds.over_turned)} against the same antennas rotated"

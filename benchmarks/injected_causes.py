@@ -49,6 +49,7 @@ from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs import compare_flight as compare
+from aerpaw_cmp.jobs.likely_cause import cause_of
 from aerpaw_cmp.site.siteyaml import load_site
 
 Fault = Callable[[Table, np.random.Generator], None]
@@ -375,7 +376,7 @@ def healthy(flights: list[Flight]) -> None:
 
 def time_of_cause(field: Path) -> None:
     """Print the share of the cause in the processor time of reports of dataset 12."""
-    spent_s, cause_of = [0.0], compare.cause_of
+    spent_s = [0.0]
 
     def timed(*given: Any) -> Any:
         start = process_time()
@@ -384,7 +385,7 @@ def time_of_cause(field: Path) -> None:
         return found
 
     flight = Path(__file__).parents[1] / "tests/field/dataset12_40m.yaml"
-    with tempfile.TemporaryDirectory() as out, unittest.mock.patch.object(compare, "cause_of", timed):
+    with tempfile.TemporaryDirectory() as out, unittest.mock.patch.object(compare, cause_of.__name__, timed):
         for number in range(3):
             start = 0.0 if number == 0 else process_time()
             with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):

@@ -88,7 +88,7 @@ def scaling_tables(scaling: dict[str, Any]) -> list[str]:
     for axis, result in scaling.items():
         title, what = AXES[axis]
         cpu, memory = power(result["power_cpu"]), power(result["power_memory"])
-        fitted = "" if axis == "workers" else f" Growth: size to the power of {cpu} (time), {memory} (memory)."
+        fitted = "" if axis == "workers" else f" Time grows with the size to the power of {cpu}, memory with {memory}."
         out += [f"### {title}", "", f"{what[0].upper()}{what[1:]}.{fitted}", ""]
         out += ["| size | processor s | wall s | peak MiB |", "| ---: | ---: | ---: | ---: |"]
         for row in result["rows"]:

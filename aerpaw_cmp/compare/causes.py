@@ -925,7 +925,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
     """Yield samples without detection, which have the same least level."""
     if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
-        # means over seconds spread less than samples
+        # if the levels vary, they are noise: means over seconds vary less, so a margin above the median is enough
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         yield Trial(
             name="no detection", clipped=e.least, estimate=(level, level, level),

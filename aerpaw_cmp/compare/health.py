@@ -22,7 +22,8 @@ BIN_S, _MOST_BINS = 4.0, 1000
 # Largest time and distance between two means from which the correlation is estimated.
 _LONGEST_S, _LONGEST_M = 100.0, 150.0
 # Prior standard deviations over flights: of the RMSE as a share of the RMSE, and of the difference of two channels
-# [dB]. Each counts as two flights. Six held-out series of one campaign have 8 % and 0.3 dB.
+# [dB]. Each counts as two flights. In one campaign, the RMSE of six held-out series varies by 8 %, and the difference
+# of channels by 0.3 dB.
 _RMSE_SHARE, _DIFFERENCE_SD_DB = 0.08, 1.0
 _LEAST_SD_DB = 0.3
 

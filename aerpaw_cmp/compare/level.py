@@ -519,7 +519,7 @@ class DetectionForecast:
     per_db : float
         Slope of the log odds.
     share : float
-        Share of detected samples, averaged over the flights. It is the forecast without a level.
+        Share of detected samples, averaged over the flights. It is the forecast where no level is predicted.
     """
 
     level_db: float

@@ -613,7 +613,7 @@ def run_predict(
     known = named_flights(flights)
     if known and (target.carrier_hz is not None or target.tx_power_dbm is not None):
         raise UsageError(
-            "--with and --carrier-ghz or --tx-power-dbm", expected="one of them: flights state carrier and power"
+            "--with and --carrier-ghz or --tx-power-dbm", expected="only --with: flights state carrier and power"
         )
     inputs = [*target_files(where, target.site, options.logs_root), *files_of(known, options.logs_root)]
     folder = options.out or Path("reports") / f"prediction-{where.stem}"

@@ -244,7 +244,7 @@ class WebServer(ThreadingHTTPServer):
         del self.waiting[request]
 
     def _read(self, request: Any, ready: selectors.BaseSelector) -> None:
-        """Read a part of a request. Answer it in a separate thread if it seems to have the token."""
+        """Read a part of a request. Pass a complete request with the token to a thread, and refuse others."""
         if request not in self.waiting:
             return  # the request was closed earlier in this loop
         waiting, data = self.waiting[request], b""

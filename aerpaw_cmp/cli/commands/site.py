@@ -248,7 +248,7 @@ def map_(
 def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
     """Print the share of covered positions per tower, antennas and height, for the foliage model of the paper."""
     lines: dict[tuple[str, str], dict[str, str]] = {}
-    alone = len({row["tower"] for row in rows}) == 2  # the nearest of one tower is this tower
+    alone = len({row["tower"] for row in rows}) == 2  # one tower is always the nearest one
     for row in (row for row in rows if row["foliage"] == settings.shown and not (alone and row["tower"] == "joint")):
         tower = row["tower"].replace("joint", "nearest tower")
         antennas = "one element" if row["antennas"] == "SISO" else f"{settings.elements} elements in phase"

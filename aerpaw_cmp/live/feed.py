@@ -23,7 +23,7 @@ from typing import Any
 
 from ..logs.files import Record
 from .modem import RI_QUERY
-from .ports import TapStatus
+from .ports import STALE_S, TapStatus
 
 # Number of rows that are stored: two hours at 10 Hz, ten hours at 2 Hz.
 ROWS = 72_000
@@ -32,7 +32,6 @@ _PENDING = 20_000
 CHUNK = 4_000
 _ALARMS = 300
 _LONGEST_TEXT = 300
-STALE_S = 3.0
 _GPS_LOST_S = 5.0
 _CLOCK_OFF_S = 2.0
 _DISK_LOW_BYTES = 200 * 2**20
@@ -104,6 +103,7 @@ class _Modem:
     predicted: Rows = field(default_factory=Rows)
     period_s: float = 0.5
     rank_s: float = 0.0
+    level_s: float = 0.0
     gps_s: float = 0.0
     step_s: float | None = None
     step_text: str = ""
@@ -115,9 +115,16 @@ class _Modem:
     # the status has the first four, too, but a record may be later
     _SHOWN = ("connected", "rank", "rsrp_dbm", "sinr_db", "name", "port", "predicts", "offset_db", "inside", "ended")
 
-    def shown(self) -> dict[str, Any]:
-        """Return the present values that the page shows."""
-        return asdict(self.status) | {name: getattr(self, name) for name in self._SHOWN}
+    @property
+    def stale_s(self) -> float:
+        """Age from which a measured value is not the present one [s]."""
+        return max(STALE_S, 3 * self.period_s)
+
+    def shown(self, now: float) -> dict[str, Any]:
+        """Return the present values that the page shows, and the age of the rank. Old levels are None."""
+        ages = {"rank_age_s": round(now - self.rank_s, 3), "stale_s": self.stale_s}
+        levels = {} if now - self.level_s <= self.stale_s else {"rsrp_dbm": None, "sinr_db": None}
+        return asdict(self.status) | {name: getattr(self, name) for name in self._SHOWN} | levels | ages
 
 
 class Feed:
@@ -186,7 +193,7 @@ class Feed:
                 return None, cursor
             now, modems, complete, following = self.now(), [], True, []
             for index, modem in enumerate(self._modems):
-                content = modem.shown()
+                content = modem.shown(now)
                 for place, (key, table) in enumerate((("rows", modem.measured), ("predictions", modem.predicted))):
                     first, data = table.after(rows[2 * index + place])
                     content[key] = [first, data]
@@ -257,6 +264,7 @@ class Feed:
         if record["query"] == "servingcell":
             cell = decoded.get("nr") or {}
             modem.rsrp_dbm, modem.sinr_db = _finite(cell.get("rsrp_dbm")), _finite(cell.get("sinr_db"))
+            modem.level_s = self._seconds(record["last_mono_ns"])
         elif record["query"] == RI_QUERY:
             # the modem read its rank between the query and the end of the answer
             t = self._seconds((record["sent_mono_ns"] + record["last_mono_ns"]) // 2)
@@ -264,7 +272,9 @@ class Feed:
             modem.rank = None if rank is None else int(rank)
             if modem.rank is not None:
                 modem.rank_s = t
-            # levels come from another query at a slower rate: store the last known levels with each rank
+            # levels come from another query at a slower rate: store the last levels with each rank unless they are old
+            if t - modem.level_s > modem.stale_s:
+                modem.rsrp_dbm = modem.sinr_db = None
             modem.measured.add((t, modem.rank, modem.rsrp_dbm, modem.sinr_db))
             modem.sent.append((record["sent_utc_ns"], t))
 
@@ -297,7 +307,7 @@ class Feed:
         if modem.connected:
             modem.rank_s = self._seconds(record["mono_ns"])
         else:
-            modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # the last measured values are not valid during a gap
+            _clear(modem)
 
     def _take_clock(self, modem: _Modem, record: Record) -> None:
         step_s = record["step_ns"] / 1e9
@@ -307,6 +317,7 @@ class Feed:
 
     def _take_end(self, modem: _Modem, _record: Record) -> None:
         modem.connected, modem.ended, modem.gap_text = False, True, ""
+        _clear(modem)
 
     # alarms -----------------------------------------------------------------------------------------------
 
@@ -337,6 +348,11 @@ class Feed:
         return changed
 
 
+def _clear(modem: _Modem) -> None:
+    """Remove the last measured values, because they are not valid in a gap or after the end."""
+    modem.rank = modem.rsrp_dbm = modem.sinr_db = None
+
+
 def _finite(value: Any) -> float | None:
     """Return a finite number of a record, else None. A crafted log may contain anything."""
     return value if isinstance(value, (int, float)) and math.isfinite(value) else None
@@ -345,7 +361,7 @@ def _finite(value: Any) -> float | None:
 def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
     """Return the alarms that are active at this moment, by kind."""
     alarms: dict[str, str] = {}
-    stale_s, lost_s = max(STALE_S, 3 * modem.period_s), max(_GPS_LOST_S, 3 * modem.period_s)
+    stale_s, lost_s = modem.stale_s, max(_GPS_LOST_S, 3 * modem.period_s)
     if modem.gap_text:
         alarms["gap"] = modem.gap_text
     elif modem.connected and now - modem.rank_s > stale_s:

@@ -157,7 +157,7 @@ class TapLog:
         except OSError as error:
             raise InputError(
                 f"cannot write a log here ({error.strerror})",
-                expected="a folder that can be written to",
+                expected="a folder after -o that can be written to",
                 cause=_disk_cause(error),
                 path=self._folder,
             ) from None

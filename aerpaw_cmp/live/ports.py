@@ -215,10 +215,14 @@ def _denied(path: Path) -> InputError:
         owner, group = pwd.getpwuid(state.st_uid).pw_name, grp.getgrgid(state.st_gid).gr_name
     except KeyError:
         owner, group = str(state.st_uid), str(state.st_gid)
+    if state.st_mode & 0o060 == 0o060:
+        expected, step = f"a user of group {group!r}", f"'sudo usermod -aG {group} $USER' and log in again"
+    else:
+        expected, step = f"the user {owner!r}, because its group may not open it", f"'sudo chown $USER {path}'"
     return InputError(
         f"no permission to open the port (owner {owner}, group {group}, mode {stat.S_IMODE(state.st_mode):o})",
-        expected=f"a user of group {group!r}",
-        cause=f"run 'sudo usermod -aG {group} $USER' and log in again",
+        expected=expected,
+        cause=f"run {step}",
         path=path,
     )
 
@@ -543,12 +547,19 @@ def format_status(status: TapStatus) -> str:
     return "  ".join(parts)
 
 
+# Measured values older than this are not the present ones.
+STALE_S = 3.0
 # A slot that is late by at most this many periods is polled at once. Older slots are missed and counted.
 _CATCH_UP = 2
+# The first query is polled at most this many times in a row while another query is due.
+_IN_A_ROW = 3
 
 
 class Schedule:
     """The order and times of the queries. If several are due, the first query has priority, then the longest waiting.
+
+    A modem that needs longer for an answer than the period of the first query is still asked the other queries: one
+    after every three polls of the first.
 
     After a short stall the missed polls follow each other immediately, with their true times in the records, so no
     answer is lost. After a long stall the schedule starts from now.
@@ -563,6 +574,7 @@ class Schedule:
         self._periods = periods_ns
         self._first = next(iter(periods_ns))
         self._due: dict[str, int] = {}
+        self._in_a_row = 0
         self.missed: Counter[str] = Counter()
 
     def reset(self, now_ns: int) -> None:
@@ -571,9 +583,10 @@ class Schedule:
 
     def next(self, now_ns: int) -> tuple[str, int]:
         """Return the name and due time of the next poll."""
-        if self._due[self._first] <= now_ns:
-            return self._first, self._due[self._first]
         name = min(self._due, key=lambda n: self._due[n])
+        if self._due[self._first] <= now_ns:
+            others = {n: due for n, due in self._due.items() if n != self._first and due <= now_ns}
+            name = min(others, key=others.__getitem__) if others and self._in_a_row >= _IN_A_ROW else self._first
         return name, self._due[name]
 
     def started(self, name: str, now_ns: int) -> None:
@@ -582,6 +595,7 @@ class Schedule:
         late = max(0, (now_ns - self._due[name]) // period)
         skipped = late if late > _CATCH_UP else 0
         self.missed[name] += skipped
+        self._in_a_row = self._in_a_row + 1 if name == self._first else 0
         self._due[name] += (skipped + 1) * period
 
     def slots(self, duration_ns: int) -> dict[str, int]:

@@ -36,6 +36,16 @@ RATE_WINDOW_S = 10.0
 # Settings that the header of the log contains.
 _IN_HEADER = ("ri_hz", "other_hz", "pause_s", "answer_timeout_s", "enable_csi")
 _NOISE_LINES_PER_S = 50
+# Causes of +CME ERROR codes (3GPP TS 27.007, clause 9.2) that a healthy RM5xxQ may send.
+_CME_CAUSES = {
+    "10": "no SIM card is inserted",
+    "11": "the SIM card asks for its PIN",
+    "12": "the SIM card asks for its PUK",
+    "13": "the SIM card failed",
+    "14": "the SIM card is busy",
+    "15": "this is the wrong SIM card",
+    "30": "there is no network service",
+}
 
 
 _NMEA = re.compile(rb"\$[A-Z]{4,5},[^\r\n]*\*[0-9A-F]{2}")
@@ -53,7 +63,7 @@ def _not_a_modem(path: Path, received: bytes) -> InputError:
         )
     elif received:
         excerpt = ascii(modem.Redactor().clean(received[:40].decode("latin-1"), cut=True))
-        sign, cause = f"the port sends {excerpt} but no answer", "another device, or a wrong baud rate"
+        sign, cause = f"the port sends {excerpt} but no answer", "another device, or another baud rate than 115200"
     else:
         sign, cause = "nothing answers on the port", "the modem is off, still starts, or this is not its AT port"
     return InputError(sign, expected=expected, cause=cause, path=path)
@@ -119,6 +129,7 @@ class Tap:
         self._noise = Counter[str]()
         self._said: set[str] = set()
         now = self._clock.mono_ns()
+        self._level_ns = 0
         self._start_ns = self._last_final_ns = self._last_csi_ns = self._status_ns = self._rest_until_ns = now
         self._noise_ns = now
         self._offset_ns: int | None = None
@@ -497,6 +508,8 @@ class Tap:
         name, status, decoded = record["query"], record["status"], record["decoded"]
         if name == modem.RI_QUERY:
             self._last["rank"] = decoded.get("rank")
+            if record["sent_mono_ns"] - self._level_ns > ports.STALE_S * 1e9:
+                self._last["rsrp_dbm"] = self._last["sinr_db"] = None
             if status == "ok":
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
@@ -504,10 +517,13 @@ class Tap:
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
                     self._worker.ask(Asked(middle, record["sent_utc_ns"], decoded.get("rank"), self._last["rsrp_dbm"]))
             elif status in ("error", "cme"):
-                self._say_once(f"the modem answers {status.upper()} to {name}: is it an RM5xxQ?")
+                code = record.get("code", "")
+                said = f"+CME ERROR: {code}" if status == "cme" else "ERROR"
+                self._say_once(f"the modem answers {said} to {name}: {_CME_CAUSES.get(code, 'is it an RM5xxQ?')}")
         elif name == "servingcell":
             nr = decoded.get("nr") or {}
             self._last["rsrp_dbm"], self._last["sinr_db"] = nr.get("rsrp_dbm"), nr.get("sinr_db")
+            self._level_ns = record["last_mono_ns"]
 
     def _other(self, event: modem.Event) -> None:
         """Record a line or an answer that does not belong to the command in flight."""

@@ -88,6 +88,10 @@ def test_no_permission_names_the_group(modem, tmp_path):
     said = opened_by_nobody(sim.node)
     assert "no permission to open the port (owner root, group dialout, mode 660)" in said
     assert "usermod -aG dialout" in said
+    sim.node.chmod(0o600)
+    said = opened_by_nobody(sim.node)
+    assert f"run 'sudo chown $USER {sim.node}'" in said
+    assert "usermod" not in said
 
 
 def test_the_port_vanishes_during_open(monkeypatch):
@@ -241,7 +245,8 @@ def test_rubbish_without_end_is_counted_not_kept(modem, tap, tools, tmp_path):
 def test_a_modem_of_another_make(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, error_every=1))
     session = tap(sim.port)
-    session.wait(lambda: any("is it an RM5xxQ?" in text for text in session.said))
+    said = "the modem answers +CME ERROR: 14 to nr5g_csi: the SIM card is busy"
+    session.wait(lambda: said in session.said)
     session.end()
     assert all(r["code"] == "14" for r in tools.exchanges(tmp_path / "log", "nr5g_csi"))
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.live.feed import CHUNK, MEASURED, STALE_S, Feed, Rows
-from aerpaw_cmp.live.ports import TapStatus
+from aerpaw_cmp.live.feed import CHUNK, MEASURED, Feed, Rows
+from aerpaw_cmp.live.ports import STALE_S, TapStatus
 from aerpaw_cmp.live.predict import RunningInterval
 from aerpaw_cmp.live.web import Address, Limits, WebServer
 from tests.live.terminals import until
@@ -500,6 +500,20 @@ def test_a_telemetry_clock_that_is_off(delay_s, words):
     assert [words in text for text in texts] == ([True] if words else [])
 
 
+def test_old_values_are_not_shown_as_present_ones():
+    hand = Hand()
+    hand.answer(query="servingcell", nr={"rsrp_dbm": -91, "sinr_db": 14})
+    for _ in range(12):
+        hand.answer()
+    levels = rows_of(hand.feed.after("")[0])[:, 2]
+    assert levels[:6].tolist() == [-91.0] * 6  # six answers are 3 s
+    assert np.isnan(levels[6:]).all()
+    hand.now_ns += 7 * SECOND
+    shown = hand.feed.after("")[0]["modems"][0]
+    assert (shown["rank"], shown["rank_age_s"], shown["stale_s"]) == (2, 7.0, STALE_S)
+    assert shown["rsrp_dbm"] is None
+
+
 def test_crafted_records_of_a_log_are_left_out():
     hand = Hand()
     for record in (
@@ -528,6 +542,9 @@ def test_the_end_is_said_to_all():
     hand = Hand()
     hand.answer()
     _, cursor = hand.feed.after("")
+    assert hand.feed.after("")[0]["modems"][0]["rank"] == 2
+    hand.put({"kind": "end", "mono_ns": hand.mono_ns})
+    assert hand.feed.after("")[0]["modems"][0]["rank"] is None
     hand.feed.end({"text": "over", "commands": ["a"]})
     assert hand.feed.after(cursor)[0]["ended"]["text"] == "over"
 

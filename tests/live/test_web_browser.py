@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -219,10 +220,24 @@ def test_without_predictions_the_page_shows_what_was_measured(driver, fly):
     assert text(driver, "rank-words") == "dots measured"
 
 
+def test_an_old_rank_is_marked_as_old(driver, fly):
+    flight = fly()
+    flight.fly(4, predicted=None)
+    until(driver, "document.querySelector('.big')?.textContent === '2'")
+    flight.now_ns += 20 * SECOND  # only statuses come, because the modem is silent
+    flight.status()
+    until(driver, "document.querySelector('.card.stale .big.none')?.textContent.startsWith('2\\n2')")
+    assert re.fullmatch(r"2\n2\d s old", driver.find_element("class name", "big").text)
+    flight.fly(predicted=None)
+    until(driver, "document.querySelector('.card:not(.stale) .big')?.textContent === '2'")
+
+
 def test_two_modems_at_once(driver, fly):
     flight = fly(("left", "right"), background=made_map())
-    flight.fly(5, modem=0, rank=1)
-    flight.fly(8, modem=1, rank=4)
+    for _ in range(5):
+        flight.fly(modem=0, rank=1)
+        flight.fly(modem=1, rank=4)
+    flight.fly(3, modem=1, rank=4)
     until(driver, "live.state.modems[1]?.rows.columns.t.length === 8")
     frame(driver)
     cards = driver.find_elements("css selector", "#modems .card")

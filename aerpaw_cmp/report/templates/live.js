@@ -126,8 +126,10 @@
       const card = host.children[i], now = modem.now, c = modem.predictions.columns, k = c.t.length - 1, [name, big, facts] = card.children;
       card.setAttribute("aria-pressed", String(i === state.chosen && state.modems.length > 1));
       name.children[0].textContent = now.name; name.children[1].textContent = now.port === now.name ? "" : now.port;
-      big.textContent = now.rank ?? (now.connected ? "no CSI" : now.ended ? "ended" : "no modem"); big.className = now.rank ? "big" : "big none"; big.style.color = now.rank ? css(`--rank${now.rank}`) : "";
-      big.setAttribute("aria-label", now.rank ? `measured rank ${now.rank}` : "no rank");
+      const age = now.rank_age_s + (Date.now() - state.received) / 1000, stale = now.rank && age > now.stale_s;
+      card.classList.toggle("stale", Boolean(stale));
+      big.textContent = stale ? `${now.rank}\n${lasted(age)} old` : now.rank ?? (now.connected ? "no CSI" : now.ended ? "ended" : "no modem"); big.className = now.rank && !stale ? "big" : "big none"; big.style.color = now.rank && !stale ? css(`--rank${now.rank}`) : "";
+      big.setAttribute("aria-label", now.rank ? `measured rank ${now.rank}${stale ? `, ${lasted(age)} old` : ""}` : "no rank");
       const rows = [["RSRP", number(now.rsrp_dbm ?? NaN, 0, "dBm")], ["SINR", number(now.sinr_db ?? NaN, 0, "dB")], ["Answers", `${number(now.ri_rate_hz, 1)} Hz`], ["Gaps", String(now.gaps)], ["Records", String(now.records)]];
       if (now.disk_free_bytes !== null) rows.push(["Disk left", now.disk_free_bytes > 2 ** 30 ? number(now.disk_free_bytes / 2 ** 30, 1, "GiB") : number(now.disk_free_bytes / 2 ** 20, 0, "MiB")]);
       if (now.predicts) rows.unshift(["Predicted rank", k < 0 ? "–" : integer(c.predicted[k]) + (Number.isFinite(c.low[k]) ? ` (${c.low[k]}${c.low[k] < c.high[k] ? "–" + c.high[k] : ""})` : "")],

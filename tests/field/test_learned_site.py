@@ -60,8 +60,15 @@ def first_words(folder: Path, site: Path, log: str) -> tuple[str, dict]:
     return page[begin : page.index("</p>", begin)], json.loads((out / "metrics.json").read_text(encoding="utf-8"))
 
 
-def test_a_drafted_flight_opens_with_what_other_flights_taught(tmp_path: Path) -> None:
-    site = LEFT_OUT["site_without"](HERE / "joint.yaml", "ds12_70m_fs20MHz.yaml", REAL, tmp_path)
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a site that learned from all campaigns, except for one flight of dataset 12."""
+    folder = tmp_path_factory.mktemp("joint")
+    path: Path = LEFT_OUT["site_without"](HERE / "joint.yaml", "ds12_70m_fs20MHz.yaml", REAL, folder)
+    return path
+
+
+def test_a_drafted_flight_opens_with_what_other_flights_taught(site: Path, tmp_path: Path) -> None:
     words, metrics = first_words(tmp_path, site, "dataset12/70m_fs20MHz.mat")
     said = re.search(r"(\d\.\d)(?:\N{NARROW NO-BREAK SPACE}| )dB", words)
     assert said is not None
@@ -73,8 +80,7 @@ def test_a_drafted_flight_opens_with_what_other_flights_taught(tmp_path: Path) -
     assert {channel["rmse_db"] for channel in metrics["rss"]["LW1"].values()} == {None}
 
 
-def test_an_unseen_flight_as_raw_logs_has_the_error_of_its_mat(tmp_path: Path) -> None:
-    site = LEFT_OUT["site_without"](HERE / "joint.yaml", "ds12_70m_fs20MHz.yaml", REAL, tmp_path)
+def test_an_unseen_flight_as_raw_logs_has_the_error_of_its_mat(site: Path, tmp_path: Path) -> None:
     log = REAL / "dataset12" / "70m_fs20MHz.mat"
     raw = LEFT_OUT["as_raw"](log, tmp_path / "raw")
     errors = []

@@ -413,7 +413,7 @@ class AdvancedRt(StrictModel):
     Parameters
     ----------
     samples : {"auto"} or int
-        Number of Sionna's rays per tower. ``auto`` increases it until two pilot runs find the same paths.
+        Number of Sionna's rays per tower. ``auto`` increases it until two trial runs find the same paths.
     gamma_db_per_m, maximum_loss_db : float, optional
         Specific attenuation and largest loss, replacing the values of P.833 at the carrier.
     maximum_gap_s : float

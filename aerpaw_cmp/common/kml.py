@@ -45,7 +45,9 @@ def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Eleme
     except (expat.ExpatError, ValueError, LookupError) as error:
         line = error.lineno if isinstance(error, expat.ExpatError) else None
         why = str(error).split(": line")[0]
-        raise InputError(f"not XML: {why}", cause="the file was cut off?", path=path, line=line) from None
+        cut = "unclosed" in why or "no element" in why
+        cause = "the file was cut off" if cut else "characters that are not UTF-8, or a '<' or '&' that is not escaped"
+        raise InputError(f"not XML: {why}", cause=cause, path=path, line=line) from None
 
 
 def plain_tag(tag: str) -> str:

@@ -10,6 +10,7 @@ their line.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,13 +32,21 @@ from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
 from . import mapfiles
 from .site import Building, Forest, Geofence
-from .siteyaml import TALLEST_TREE_M, WIDEST_CROWN_M, SingleTreeModel, SiteModel, build_site, extent_m, site_model
+from .siteyaml import (
+    TALLEST_M,
+    TALLEST_TREE_M,
+    WIDEST_CROWN_M,
+    SingleTreeModel,
+    SiteModel,
+    build_site,
+    extent_m,
+    site_model,
+)
 
 # Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0
 # Two storeys, the height of a barn or a house.
 _DEFAULT_HEIGHT_M = 6.0
-TALLEST_M = 300.0
 # Heights are rounded to centimetres, so a lower building would have no height.
 _LOWEST_M = 0.01
 # Outlines farther than this from the origin do not belong to the site.
@@ -444,6 +453,12 @@ def _describe(shape: _Shape, outline: mapfiles.Outline, actions: list[str]) -> N
     notes: list[str] = []
     height = mapfiles.height_of(tags, notes)
     levels = mapfiles.levels_of(tags, notes)
+    if height is not None and not _LOWEST_M <= height <= TALLEST_M:
+        notes.append(f"a height of {height:g} m; feet or centimetres?")
+        height = None
+    if levels and levels * _LEVEL_M > TALLEST_M:
+        notes.append(f"{levels:g} levels are more than any building has")
+        levels = None
     shape.stated, shape.assumed = height is not None, height is None and not levels
     if height is None:
         height = levels * _LEVEL_M if levels else _DEFAULT_HEIGHT_M
@@ -452,12 +467,6 @@ def _describe(shape: _Shape, outline: mapfiles.Outline, actions: list[str]) -> N
     if (mapfiles.metres(lowest) or 0.0) > 0:
         notes.append("it begins above the ground (min_height, min_level), but is drawn from the ground up")
     actions += [f"{shape.source}: {note}" for note in notes]
-    if not _LOWEST_M <= height <= TALLEST_M:
-        raise InputError(
-            f"{shape.source}: a building {height:g} m high",
-            expected=f"{_LOWEST_M:g} to {TALLEST_M:g} m",
-            cause="feet or centimetres in place of metres",
-        )
     shape.height_m = height
     shape.material = mapfiles.material_of(tags)
     # a metre has 3.28 feet, so such a ratio of height to storeys is suspicious
@@ -738,9 +747,9 @@ def _around_towers(content: dict[str, Any], imports: Footprints, frame: SiteFram
 def name_and_value(text: str, option: str, example: str) -> tuple[str, str]:
     """Return both sides of ``NAME=VALUE``, the text of an option. UsageError if one of them is missing."""
     name, mark, value = text.partition("=")
-    if not (mark and name and value):
+    if not (mark and name.strip() and value):
         raise UsageError(f"{option} '{text}'", expected=f"{option} {example}")
-    return name, value
+    return name.strip(), value
 
 
 def numbers_of(text: str, counts: tuple[int, ...], what: str, expected: str) -> list[float]:
@@ -769,7 +778,8 @@ def numbers_of(text: str, counts: tuple[int, ...], what: str, expected: str) -> 
     except ValueError:
         values = []
     if len(values) not in counts:
-        raise UsageError(f"{what} '{text}'", expected=expected)
+        cause = "degrees and minutes, a unit or a decimal comma" if re.search(r"\d", text) else None
+        raise UsageError(f"{what} '{text}'", expected=expected, cause=cause)
     return values
 
 

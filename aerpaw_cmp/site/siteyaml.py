@@ -12,8 +12,9 @@ assumed to be a quarter of the height.
 from __future__ import annotations
 
 import math
+import re
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
 from functools import cache, lru_cache
@@ -41,6 +42,9 @@ from .site import Building, Forest, Geofence, Site, Tower, Trees
 
 # Packaged sites by name.
 PACKAGED = ("lake_wheeler",)
+
+# The name of the nearest tower in layers of maps, such as rank_k10_h030m_joint_opaque.
+_NEAREST = "joint"
 
 # A tower is refused if it is farther than this from both the origin and the area.
 _FAR_TOWER_M = 10_000.0
@@ -415,9 +419,10 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     with _at("scene"):
         scene, scene_notes = _scene(model, folder or Path())
         notes += scene_notes
-    towers = {}
+    towers: dict[str, Tower] = {}
     for name, tower in model.towers.items():
         with _at("towers", name):
+            _check_name(name, towers)
             towers[name] = _tower(name=name, model=tower, site=model, frame=frame, dem=dem, notes=notes)
             _check_tower(towers[name], model.area_m, frame)
     with _at("area_m"):
@@ -624,6 +629,19 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
     first = " and ".join(f"'{buildings[i].name}'" for i in overlapping[0])
     more = "" if len(overlapping) == 1 else f" and {counted(len(overlapping) - 1, 'more pair')}"
     return [f"warning: the buildings {first}{more} overlap; 'aerpaw-cmp site import' makes outlines disjoint"]
+
+
+def _check_name(name: str, others: Iterable[str]) -> None:
+    """Refuse a name that a map could not distinguish in its files from the nearest tower or from another tower."""
+    in_files = re.sub(r"\W", "_", name)
+    if name == _NEAREST:
+        raise UsageError(f"a tower named '{name}'", expected="another name", cause="maps call the nearest tower so")
+    if twin := next((other for other in others if re.sub(r"\W", "_", other) == in_files), None):
+        raise UsageError(
+            f"towers '{twin}' and '{name}'",
+            expected="names that differ in letters or digits",
+            cause=f"both are '{in_files}' in the names of layers and files",
+        )
 
 
 def _unmapped(towers: Mapping[str, Tower], shapes: list[Polygon]) -> list[str]:

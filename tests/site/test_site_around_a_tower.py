@@ -71,6 +71,8 @@ def test_towers_replace_those_of_a_base(tmp_path: Path) -> None:
         ("roof=151.2,-33.86,25", "longitude before latitude"),
         ("roof=-33.86,151.2,25000", "a height outside"),
         ("roof=-33.86,151.2,nan", "a height outside"),
+        ("roof=33°51'36\"S,151°12'0\"E,25", "degrees and minutes, a unit or a decimal comma"),
+        (" =-33.86,151.2,25", "expected --tower NAME=LATITUDE,LONGITUDE,HEIGHT"),
     ],
 )
 def test_a_tower_that_cannot_be_is_one_message(text: str, words: str, tmp_path: Path) -> None:

@@ -250,7 +250,7 @@ def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
     lines: dict[tuple[str, str], dict[str, str]] = {}
     alone = len({row["tower"] for row in rows}) == 2  # one tower is always the nearest one
     for row in (row for row in rows if row["foliage"] == settings.shown and not (alone and row["tower"] == "joint")):
-        tower = row["tower"].replace("joint", "nearest tower")
+        tower = "nearest tower" if row["tower"] == "joint" else row["tower"]
         antennas = "one element" if row["antennas"] == "SISO" else f"{settings.elements} elements in phase"
         line = lines.setdefault((tower, antennas), {"tower": tower, "antennas": antennas})
         line[f"{row['altitude_m']:g} m"] = f"{100.0 * row['coverage']:.1f} %"

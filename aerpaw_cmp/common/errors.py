@@ -333,6 +333,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return f"'aerpaw-cmp ingest LOG TELEMETRY --draft flight.yaml' drafts it with telemetry; {named}"
     if again := re.search(r"(?:learn it again: |(?=pip install))(.+?)(?:, or |$)", error.expected or ""):
         return again[1]
+    if " it with: " in error.found:  # a missing or damaged Sionna RT
+        return "run that line, or use the engine 'image'"
     if isinstance(error, CheckError):
         return "read the page, or run without the check"
     if isinstance(error, OutputError) or re.search(r"after -o\b|-o NAME|a new name", error.expected or ""):

@@ -24,7 +24,7 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
-from ..common.errors import CheckError
+from ..common.errors import UsageError
 from ..common.files import cache_folder
 from ..common.versions import version
 
@@ -171,6 +171,10 @@ def _system_paths() -> list[Path]:
     return paths
 
 
+class SionnaMissingError(UsageError):
+    """The error that Sionna RT cannot be loaded. Only the audit and ``rt.engine: sionna`` need it."""
+
+
 def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
     """Return the libLLVM files in the order of trials: newest first, unknown versions last.
 
@@ -178,17 +182,14 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
 
     Raises
     ------
-    CheckError
+    SionnaMissingError
         If ``DRJIT_LIBLLVM_PATH`` names no file.
     """
     if chosen := environ.get(LIBRARY_VARIABLE):
         path = Path(chosen)
         if not path.is_file():
-            raise CheckError(
-                f"{LIBRARY_VARIABLE} names {chosen}, which is not a file",
-                expected="the path of a libLLVM",
-                cause=f"an old setting; 'unset {LIBRARY_VARIABLE}' lets one be found",
-            )
+            found = f"{LIBRARY_VARIABLE} names {chosen}, which is not the file of a libLLVM"
+            raise SionnaMissingError(f"{found}. Repair it with: unset {LIBRARY_VARIABLE}")
         return [_library(path) or Library(path.resolve(), ())]
     if folders := environ.get(FOLDERS_VARIABLE):
         paths = [path for folder in folders.split(os.pathsep) for path in Path(folder).glob("libLLVM*")]
@@ -290,7 +291,8 @@ def try_variant(variant: str) -> Trial:
 
 def _verdict(library: Library | None, reason: str) -> Trial:
     missing = _missing_library(reason) if reason.startswith("Dr.Jit cannot be loaded") else ""
-    blameless = missing or "ModuleNotFoundError" in reason or "ImportError" in reason
+    # Dr.Jit reports a library that it cannot load as an ImportError, too
+    blameless = missing or (re.search("ModuleNotFoundError|ImportError", reason) and "LLVM" not in reason)
     return Trial(library, not reason, reason, not blameless, missing)
 
 
@@ -341,10 +343,6 @@ def _trials() -> tuple[Trial, ...]:
     return tuple(first_that_works(candidates(), _cached_trial))
 
 
-class SionnaMissingError(CheckError):
-    """The error that Sionna RT cannot be loaded. Only the audit and ``rt.engine: sionna`` need it."""
-
-
 def prepare_llvm() -> Path:
     """Select an LLVM that works for Dr.Jit. Call this before importing drjit, mitsuba or sionna.
 
@@ -360,8 +358,7 @@ def prepare_llvm() -> Path:
     """
     trials = _trials()
     if not trials or not trials[-1].ok or trials[-1].library is None:
-        line = INSTALL_AGAIN if sionna_fails(trials) else install_line()
-        raise SionnaMissingError(f"{explain(trials)}. Repair it with: {line}")
+        raise SionnaMissingError(f"{explain(trials)}. Repair it with: {remedy(trials)}")
     # Dr.Jit reads the variable only once, on import
     os.environ[LIBRARY_VARIABLE] = str(trials[-1].library.path)
     return trials[-1].library.path
@@ -385,6 +382,14 @@ INSTALL_AGAIN = "pip install --force-reinstall sionna-rt"
 def sionna_fails(trials: Sequence[Trial]) -> bool:
     """Check whether the last trial failed because of Sionna RT or a package that it needs, not because of an LLVM."""
     return bool(trials) and not trials[-1].ok and not trials[-1].blames_library and not trials[-1].missing
+
+
+def remedy(trials: Sequence[Trial]) -> str:
+    """Return the command line that lets Sionna RT load after trials that failed."""
+    if sionna_fails(trials):
+        return INSTALL_AGAIN
+    chosen = os.environ.get(LIBRARY_VARIABLE) and trials and not trials[-1].missing
+    return f"unset {LIBRARY_VARIABLE}" if chosen else install_line()
 
 
 def explain(trials: Sequence[Trial]) -> str:

@@ -16,7 +16,7 @@ from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, load_flight
 from aerpaw_cmp.jobs import audit_flight
 from aerpaw_cmp.propagation.geometry import Poses
-from aerpaw_cmp.propagation.llvm import INSTALL_AGAIN
+from aerpaw_cmp.propagation.llvm import INSTALL_AGAIN, SionnaMissingError
 from aerpaw_cmp.propagation.search import sionna
 from tests.jobs.test_audit_raw import write_flight
 
@@ -77,9 +77,15 @@ def test_flight_is_replayed_where_sionna_rt_cannot_be_loaded(tmp_path, monkeypat
     assert "mitsuba" in engine.not_audited
 
 
-def test_an_installed_sionna_rt_that_fails_is_to_be_repaired() -> None:
-    message = str(sionna._missing(ImportError("libdrjit-core.so: undefined symbol")))
-    assert message.startswith("Sionna RT cannot be loaded (libdrjit-core.so: undefined symbol)")
+@pytest.mark.parametrize("program", ["raise ImportError('undefined symbol')", "raise OSError('undefined symbol')"])
+def test_an_installed_sionna_rt_that_fails_is_to_be_repaired(tmp_path, monkeypatch, program) -> None:
+    (tmp_path / "mitsuba.py").write_text(program)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mitsuba", raising=False)
+    with pytest.raises(SionnaMissingError) as caught:
+        sionna.load_variant()
+    message = str(caught.value)
+    assert message.startswith("Sionna RT cannot be loaded (undefined symbol)")
     assert message.endswith(f"Repair it with: {INSTALL_AGAIN}")
 
 

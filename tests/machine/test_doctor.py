@@ -32,6 +32,7 @@ def with_trials(monkeypatch: pytest.MonkeyPatch, *trials: llvm.Trial) -> list[do
     monkeypatch.setattr(llvm, "candidates", list)
     monkeypatch.setattr(llvm, "first_that_works", lambda _: list(trials))
     monkeypatch.setattr(llvm, "install_line", lambda: "the line")
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
     return list(doctor.llvm_checks())
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.common.errors import CheckError
+from aerpaw_cmp.common.errors import UsageError, next_step
 from aerpaw_cmp.propagation import llvm
 from tools import setup_llvm as setup
 
@@ -68,7 +68,7 @@ def test_the_users_choice_stands_alone(folders: tuple[Path, dict[str, str]]) -> 
 def test_the_users_choice_must_exist(folders: tuple[Path, dict[str, str]]) -> None:
     folder, environ = folders
     put(folder, "libLLVM.so.19.1")
-    with pytest.raises(CheckError, match=r"not a file.*unset DRJIT_LIBLLVM_PATH"):
+    with pytest.raises(llvm.SionnaMissingError, match=r"not the file of a libLLVM.*: unset DRJIT_LIBLLVM_PATH"):
         llvm.candidates({**environ, llvm.LIBRARY_VARIABLE: str(folder)})
 
 
@@ -93,6 +93,7 @@ def test_an_unnamed_version_is_refused_by_what_the_child_says() -> None:
     [
         (ABORTS, "ended by signal 6: LLVM ERROR: Cannot select: fmaximum"),
         ("raise OSError('no such thing')", "ended with 1: OSError: no such thing"),
+        ("raise ImportError('the LLVM backend is inactive')", "ImportError: the LLVM backend is inactive"),
         ("print('{}')", "path lengths are wrong"),
         ('print(\'{"right": false, "found_m": [1.0]}\')', r"path lengths are wrong: \[1.0\]"),
         ("print('[1')", "answer is unreadable"),
@@ -197,9 +198,9 @@ def test_prepare_without_any_gives_the_line_that_mends_it(tmp_path: Path, monkey
     as_root_on_debian(monkeypatch, tmp_path)
     monkeypatch.setattr(llvm, "known_to_apt", lambda: "libllvm19 - x\n")
     llvm._trials.cache_clear()
-    with pytest.raises(CheckError, match=r"no libLLVM was found.*apt-get install -y libllvm19") as caught:
+    with pytest.raises(UsageError, match=r"no libLLVM was found.*apt-get install -y libllvm19") as caught:
         llvm.prepare_llvm()
-    assert caught.value.exit_code == 1
+    assert next_step(caught.value, ["report", "flight.yaml"]) == "run that line, or use the engine 'image'"
     llvm._trials.cache_clear()
 
 

@@ -74,10 +74,8 @@ def load_variant() -> str:
 
     Raises
     ------
-    UsageError
-        If Dr.Jit finds no device.
     SionnaMissingError
-        If Sionna RT or a package that it needs is not installed, or no LLVM works.
+        If Sionna RT or a package that it needs is not installed or damaged, no LLVM works, or Dr.Jit finds no device.
     """
     let_sionna_load()
     without_llvm: SionnaMissingError | None = None
@@ -88,7 +86,7 @@ def load_variant() -> str:
     try:
         import drjit as dr
         import mitsuba as mi
-    except ImportError as error:
+    except Exception as error:
         raise _missing(error) from error
     # Mitsuba searches the working folder first for plugins, which are native code, possibly from a third party
     resolver: Any = mi.file_resolver
@@ -99,12 +97,13 @@ def load_variant() -> str:
         if without_llvm and not has_cuda:
             raise without_llvm
         if not has_cuda and not dr.has_backend(dr.JitBackend.LLVM):
-            raise UsageError("Dr.Jit finds no device", cause="'aerpaw-cmp doctor' shows what is missing")
+            raise SionnaMissingError("Dr.Jit finds no device", cause="'aerpaw-cmp doctor' shows what is missing")
         mi.set_variant(_VARIANTS[0 if has_cuda else 1])
     return str(mi.variant())
 
 
-def _missing(error: ImportError) -> SionnaMissingError:
+def _missing(error: Exception) -> SionnaMissingError:
+    """Return the error for an import that failed. The import of a damaged package may raise any exception."""
     if isinstance(error, ModuleNotFoundError):
         return SionnaMissingError(f"Sionna RT is not installed ({error}). Install it with: pip install sionna-rt")
     return SionnaMissingError(f"Sionna RT cannot be loaded ({error}). Repair it with: {INSTALL_AGAIN}")
@@ -154,7 +153,7 @@ class _Builder:
 
         try:
             import sionna.rt as rt
-        except ImportError as error:
+        except Exception as error:
             raise _missing(error) from error
         if _ALIVE:
             gc.collect()  # an exception may still refer to a scene

@@ -32,7 +32,7 @@ _MOST_ITEMS = 100_000
 _MOST_MEMORY = 4 << 30
 SECONDS = 60
 _REFUSED = 3
-_NAMES = {"hdf5": "HDF5", "matlab": "MATLAB 7.3", "netcdf": "NetCDF-4", "geotiff": "GeoTIFF"}
+_NAMES = {"hdf5": "an HDF5", "matlab": "a MATLAB 7.3", "netcdf": "a NetCDF-4", "geotiff": "a GeoTIFF"}
 
 _CHILD = "import sys; sys.path[:] = sys.argv[2:]; from aerpaw_cmp.common.native import main; main(sys.argv[1])"
 
@@ -65,7 +65,7 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     if code == _REFUSED and lines:
         raise InputError(**json.loads(lines[-1]))
     reason = lines[-1] if lines else f"its library ended with code {code}"
-    raise InputError(f"not a {_NAMES[kind]} file, or a damaged one ({reason})", cause="a truncated download")
+    raise InputError(f"not {_NAMES[kind]} file, or a damaged one ({reason})", cause="a truncated download")
 
 
 def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:

@@ -224,5 +224,5 @@ def test_a_module_in_the_working_folder_is_not_run(tmp_path: Path, monkeypatch: 
 
 def test_a_child_that_dies_is_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native, "_CHILD", "import os; os.abort()")
-    with pytest.raises(InputError, match="not a HDF5 file, or a damaged one \\(its library ended with code -6\\)"):
+    with pytest.raises(InputError, match="not an HDF5 file, or a damaged one \\(its library ended with code -6\\)"):
         native.read("hdf5", b"x")

@@ -193,7 +193,7 @@ def _read_text(path: Path) -> str:
             raise UsageError("a folder was named", expected="a YAML file", path=path)
         data = read_bounded(path, MAX_BYTES, "a YAML file")
     except InputError as error:
-        raise UsageError(error.found, expected=error.expected, path=path) from None
+        raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path) from None
     except FileNotFoundError:
         raise InputError("no such file", expected="a YAML file", cause="a misspelt path", path=path) from None
     except OSError as error:
@@ -326,6 +326,10 @@ class _Builder:
         """Return a key as text: 'on', 1 or 1.5 is kept as written, because pydantic requires text."""
         if isinstance(event, yaml.CollectionStartEvent):
             self._fail(event, "a list or mapping is used as a key")
+        if isinstance(event, yaml.ScalarEvent) and event.value == "<<" and event.implicit[0]:
+            self._fail(
+                event, "the merge key '<<' is not supported: write the keys, or an alias in place of the whole value"
+            )
         key = self._value(event, ())
         if key is None or isinstance(key, list | dict):
             self._fail(event, "a key is empty or not a word")

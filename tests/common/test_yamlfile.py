@@ -91,10 +91,13 @@ def test_alias_bomb_and_deep_nesting_are_refused() -> None:
     assert "nested deeper" in failure("anything: " + "[" * 100_000).found
 
 
-def test_anchors_work_and_merge_keys_are_unknown_keys() -> None:
+def test_anchors_work_and_merge_keys_are_refused() -> None:
     got = parse_yaml("masts:\n  a: &base {height_m: 2, label: x}\n  b: *base", Settings)
     assert got.masts["b"] == Mast(height_m=2, label="x")
-    assert "unknown key 'masts.b.<<'" in failure("masts:\n  a: &base {label: x}\n  b: {<<: *base}").found
+    for merging in ("b: {<<: *base}", "<<: {c: *base}"):
+        refused = failure(f"masts:\n  a: &base {{label: x}}\n  {merging}")
+        assert (refused.line, "merge key '<<' is not supported" in refused.found) == (3, True)
+    assert "unknown key '<<'" in failure("'<<': 1").found
 
 
 def test_files(tmp_path: Path) -> None:

@@ -73,6 +73,12 @@ def test_the_unchanged_flight_passes(run: Run, tmp_path: Path) -> None:
         ("other_kind", {"power_log": GOOD_TELEMETRY}, 3, "vehicle_out"),
         ("no_overlap", {"power_log": GOOD_POWER.replace("2025-06-01", "2025-06-03")}, 3, "no overlap"),
         ("hours_off", {"power_log": GOOD_POWER.replace(" 10:", " 14:")}, 3, "stored as if they were UTC"),
+        (
+            "misnamed",
+            {"power_log": None, "power_logs": GOOD_POWER},
+            3,
+            "replace power_log.txt by power_logs.txt in flight.yaml",
+        ),
         ("minus_999", {"vehicleOut": GOOD_TELEMETRY.replace("35.7274,", "-999,").replace("-78.69", "-999.69")}, 3, ""),
     ],
 )
@@ -116,6 +122,15 @@ def test_bad_flight_files(run: Run, change: tuple[str, str], words: str) -> None
     code, err = run(FLIGHT.replace(*change))
     assert code == 2, err
     assert words in err
+
+
+def test_a_site_is_searched_in_the_folder_of_the_flight_file_only(run: Run, tmp_path: Path, monkeypatch: Any) -> None:
+    (work := tmp_path / "work").mkdir()
+    (work / "site.yaml").touch()
+    monkeypatch.chdir(work)
+    code, err = run(FLIGHT.replace("lake_wheeler", "site.yaml"))
+    assert code == 3
+    assert f"{tmp_path / 'site.yaml'}: no such file" in err
 
 
 @pytest.mark.parametrize("command", ["report", "map"])

@@ -100,8 +100,9 @@ def raising(error: BaseException):
         (
             UsageError("unknown key 'sight'", path="f.yaml", line=3),
             2,
-            "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'. Next: 'aerpaw-cmp report --help' lists the options\n",
+            "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'. Next: correct the value and run the same command ",
         ),
+        (UsageError("Got unexpected extra argument(s) (b.yaml)"), 2, "Next: the same command without b.yaml\n"),
         (InputError("the file is empty", path="a.txt"), 3, "aerpaw-cmp: a.txt: the file is empty. Next: 'ls "),
         (
             UsageError("RSS of LW1 has no positions and there is no telemetry log"),

@@ -341,6 +341,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "the same command with another name after -o"
     if place is not None and (reader := re.search(r"'(aerpaw-cmp [a-z]+) FILE' reads", error.found)):
         return f"'{reader[1]} {one_line(str(place))}'"
+    if error.found == "not a regular file":
+        return f"'ls -l {one_line(str(place))}' shows what is there"
     if place is not None and place.suffix in _SETTINGS and _exists(place) and words[:1] != ["ingest"]:
         line = "" if error.line is None else f", line {error.line},"
         return f"fix {one_line(place.name)}{line} and run the same command"
@@ -350,6 +352,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
             return f"the same command with {one_line(str(settings[0]))}"
         if not settings and words[:1] in _OF_LOGS:
             return f"'aerpaw-cmp ingest {one_line(str(place))} --draft flight.yaml' writes one from its logs"
+    if extra := re.match(r"Got unexpected extra argument\S* \((.+)\)", error.found):
+        return f"the same command without {one_line(extra[1])}"
     settings_file = next((word for word in arguments if word.endswith(_SETTINGS)), None)
     # a log without a time zone is correct: the key is missing in the settings
     in_file = place is None or "timezone:" in (error.expected or "")
@@ -357,10 +361,12 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return f"fix {one_line(Path(settings_file).name)} and run the same command"
     if words[:1] == ["tap"] and isinstance(error, InputError):
         return "'aerpaw-cmp doctor' lists the serial ports"
-    if place is None or not isinstance(error, InputError):
+    if re.match("Missing|No such option", error.found):
         return f"'{command} --help' lists the options"
+    if place is None or not isinstance(error, InputError):
+        return f"correct the value and run the same command ('{command} --help' describes the options)"
     if not _exists(place):
-        return _nearest(place)
+        return _nearest(place, arguments)
     if str(place) in (last for option, last in pairwise(arguments) if option == "--against"):
         return f"correct {one_line(place.name)} (docs/referee.md lists the columns) and run the same command"
     if not place.is_file():
@@ -383,17 +389,22 @@ def _exists(place: Path) -> bool:
         return False
 
 
-def _nearest(place: Path) -> str:
+def _nearest(place: Path, arguments: Sequence[str]) -> str:
     """Return a hint: a file with a similar name, or the nearest existing folder."""
+    words = {Path(word).absolute(): word for word in arguments}
     folder = place.parent
     while not _exists(folder) and folder != folder.parent:
         folder = folder.parent
     try:
-        names = [item.name for item in folder.iterdir() if item.name != place.name]
+        names = [item.name for item in folder.iterdir() if item.name != place.name and item.absolute() not in words]
     except OSError:
         names = []
     # suggest close matches only: a loose match could be another flight's file
     near = get_close_matches(place.name, names, n=1, cutoff=0.8) if folder == place.parent else []
+    settings = [path.name for path, word in words.items() if word.endswith(_SETTINGS) and _exists(path)]
+    if near and settings and place.absolute() not in words:
+        where = settings[0] if len(settings) == 1 else "the file that names it"
+        return f"replace {one_line(place.name)} by {one_line(near[0])} in {one_line(where)} and run the same command"
     if near:
         return f"the same command with {one_line(str(folder / near[0]))}"
     return f"'ls {one_line(str(folder))}' shows the names there"

@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path, PureWindowsPath
+from typing import BinaryIO
 
 from .errors import AerpawCmpError, InputError, OutputError, one_line
 
@@ -122,6 +123,21 @@ def _clear_old_parts(folder: Path, prefix: str) -> None:
                 part.unlink()
 
 
+def opened(path: Path, expected: str = "a file") -> BinaryIO:
+    """Open a file of the user for reading.
+
+    Raises
+    ------
+    InputError
+        If it is a pipe, a device or a socket. Opening or reading one may wait forever.
+    OSError
+        If it cannot be opened.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise InputError("not a regular file", expected=expected, cause="a pipe, a device or a socket", path=path)
+    return path.open("rb")
+
+
 def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
     """Return the content of a file or pipe of at most ``most`` bytes. A device could be endless.
 
@@ -139,15 +155,15 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
     Raises
     ------
     InputError
-        If the file has more bytes.
+        If the file has more bytes, or is a pipe, a device or a socket.
     OSError
         If it cannot be read.
     """
-    with path.open("rb") as file:
+    with opened(path, expected) as file:
         size = os.fstat(file.fileno()).st_size
         chunks: list[bytes] = []
         total = 0
-        # count the bytes, because pipes, devices and files of /proc report a size of 0 bytes
+        # count the bytes, because files of /proc report a size of 0 bytes
         while size <= most and total <= most and (chunk := file.read(_CHUNK)):
             chunks.append(chunk)
             total += len(chunk)

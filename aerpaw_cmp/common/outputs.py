@@ -203,7 +203,9 @@ class OutputFile:
         if not _taken(self.target):
             return
         if not self.target.is_file():
-            raise UsageError("the output exists and is not a regular file", expected="a file name", path=self.named)
+            raise UsageError(
+                "the output exists and is not a regular file", expected="a new name after -o", path=self.named
+            )
         target = _identity(self.target)
         for path in self._inputs:
             if _identity(path) == target:

@@ -239,7 +239,8 @@ class FlightData:
 
 def site_place(site: str, folder: Path) -> str | Path:
     """Return a site.yaml below the folder, or the name of a packaged site."""
-    return folder / site if (folder / site).is_file() else site
+    place = folder / site
+    return place if place.suffix in (".yaml", ".yml") or place.is_file() else site
 
 
 def choose_site(choice: SiteChoice, folder: Path) -> Site:

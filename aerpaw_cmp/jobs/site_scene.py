@@ -13,6 +13,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.files import opened
 from ..common.geodesy import SiteFrame
 from ..common.outputs import OutputFile, OutputFolder, explained_os_errors, is_sealed, sealed
 from ..common.text import counted
@@ -37,7 +38,7 @@ _LOCAL_NOTE = (
 def is_scene(path: Path) -> bool:
     """Check whether a file is the XML of a Mitsuba scene, whose first element is 'scene'."""
     try:
-        with path.open("rb") as file:
+        with opened(path, "a map or a scene") as file:
             head = file.read(65536)
     except OSError:
         return False

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.errors import InputError, UsageError, parsing
+from ..common.files import opened
 from ..common.geodesy import azimuth_rad
 from ..common.grouping import lists_by_key
 from ..common.text import counted
@@ -293,7 +294,7 @@ def _local_points(path: Path) -> Targets | None:
     if path.suffix.lower() != ".csv":
         return None
     with parsing(path, "columns east_m, north_m, height_m"):
-        with path.open("rb") as file:
+        with opened(path, "a route or points") as file:
             head = file.readline(HEAD_BYTES).decode("utf-8-sig", errors="replace")
         sign = ";" if ";" in head else ","
         if not set(_COLUMNS[:3]) <= {name.strip() for name in head.split(sign)}:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.errors import InputError
+from ..common.files import opened
 from ..logs.readers import Reader, ReadOptions
 
 RANKS = (1, 4)
@@ -304,7 +305,7 @@ class TelemetryFollower:
     def _last_lines(self) -> bytes:
         """Return the last complete lines."""
         try:
-            with self.path.open("rb") as file:
+            with opened(self.path, "a telemetry log") as file:
                 start = max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES)
                 file.seek(start)
                 data = file.read()

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
+from ..common.files import opened
 from ..common.text import counted
 from . import files as packed
 from .flight_file import IngestedFile, read_flight
@@ -88,16 +89,12 @@ def _unpacked(raw: bytes, path: str | Path) -> bytes:
     return raw if packed.packed_form(raw) is None else packed.unpacked(raw, path, most)
 
 
-def _raw(place: Path, limit: int | None = None) -> bytes:
+def _raw(place: Path, limit: int = -1) -> bytes:
     """Return all bytes on disk, or the first ``limit`` bytes."""
     try:
         if place.is_dir():
             raise InputError("a folder where a log is expected", path=place)
-        if not place.is_file() and place.exists():
-            raise InputError("not a regular file", expected="a log", path=place)
-        if limit is None:
-            return place.read_bytes()
-        with place.open("rb") as file:
+        with opened(place, "a log") as file:
             return file.read(limit)
     except FileNotFoundError as error:
         raise InputError("the file does not exist", cause="a misspelt path", path=place) from error

@@ -1,13 +1,14 @@
 """Atomic writing of files."""
 
 import os
+import socket
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import InputError, UsageError, next_step
 from aerpaw_cmp.common.files import atomic_path, inside, read_bounded
 from aerpaw_cmp.common.geodesy import SiteFrame
 
@@ -77,9 +78,13 @@ READERS_OF_WHOLE_FILES: dict[str, dict[str, Any]] = {
 }
 
 
+# Functions that read files of any size, or their first bytes.
+READERS_OF_BEGINNINGS = ("logs.ingest.read_bytes", "jobs.sources._local_points", "jobs.site_scene.is_scene")
+
+
 def read_by(name: str, path: Path) -> Any:
     module, _, function = name.rpartition(".")
-    return getattr(import_module(f"aerpaw_cmp.{module}"), function)(path, **READERS_OF_WHOLE_FILES[name])
+    return getattr(import_module(f"aerpaw_cmp.{module}"), function)(path, **READERS_OF_WHOLE_FILES.get(name, {}))
 
 
 @pytest.mark.parametrize("name", READERS_OF_WHOLE_FILES)
@@ -92,11 +97,21 @@ def test_a_file_that_is_far_too_large_is_not_read(name: str, tmp_path: Path) -> 
         read_by(name, path)
 
 
-@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
-@pytest.mark.parametrize("name", list(READERS_OF_WHOLE_FILES)[::4])
-def test_a_device_without_an_end_is_read_to_the_limit_only(name: str) -> None:
-    with pytest.raises((InputError, UsageError), match=r"it has more than \d+ bytes; expected .* at most"):
-        read_by(name, Path("/dev/zero"))
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
+@pytest.mark.parametrize("name", [*READERS_OF_WHOLE_FILES, *READERS_OF_BEGINNINGS])
+def test_a_file_without_an_end_is_not_opened(name: str, kind: str, tmp_path: Path) -> None:
+    """A pipe without a writer blocks the program that opens it."""
+    path = tmp_path / "special.csv"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        with socket.socket(socket.AF_UNIX) as address:
+            address.bind(str(path))
+    with pytest.raises((InputError, UsageError), match=r"not a regular file; expected .*: a pipe") as caught:
+        read_by(name, path)
+    assert next_step(caught.value, ["report", "flight.yaml"]) == f"'ls -l {path}' shows what is there"
 
 
 @pytest.mark.parametrize("size", [0, 1, (1 << 20) - 1, 1 << 20, (1 << 20) + 1])

@@ -236,10 +236,10 @@ def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path.chmod(0)
     if os.access(path, os.R_OK):  # root reads everything: raise what an ordinary user would get
 
-        def refuse(self: Path) -> bytes:
+        def refuse(self: Path, _: str) -> bytes:
             raise PermissionError(13, "Permission denied", str(self))
 
-        monkeypatch.setattr(Path, "read_bytes", refuse)
+        monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(InputError, match="no permission"):
         ingest(path, options=OPTIONS)
 

@@ -38,7 +38,11 @@ def predict(
     out: Annotated[Path | None, output("Output folder  [default: reports/prediction-<WHERE>]")] = None,
     height: Annotated[
         list[float] | None,
-        Option(help="Height of a grid [m], repeatable, and of route points without a height  [default: 40]"),
+        Option(
+            min=0.1,
+            max=10_000.0,
+            help="Height of a grid [m], repeatable, and of route points without a height  [default: 40]",
+        ),
     ] = None,
     spacing: Annotated[float | None, Option(min=1.0, help="Spacing of a grid [m]  [default: 30]")] = None,
     heading: Annotated[
@@ -114,7 +118,11 @@ def plan(
     speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
     height: Annotated[
         list[float] | None,
-        Option(help="Height of the tool's own routes, and of the grid of a target site [m]; repeatable  [default: 40]"),
+        Option(
+            min=0.1,
+            max=10_000.0,
+            help="Height of the tool's own routes, and of the grid of a target site [m]; repeatable  [default: 40]",
+        ),
     ] = None,
     tower_distance: Annotated[float, Option(min=0.0, help="Smallest distance to towers [m].")] = 30.0,
     out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,

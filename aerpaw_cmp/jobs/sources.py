@@ -209,7 +209,7 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
     elif is_settings(where) or not where.exists():
         targets = _grid(site, options)
     elif (local := _local_points(where)) is not None:
-        targets = local
+        targets = replace(local, remarks=(*local.remarks, *_buried(local, site)))
     else:
         targets = _route(where, site, options)
     if targets.grid is None and options.spacing_m is not None:
@@ -319,6 +319,13 @@ def _local_points(path: Path) -> Targets | None:
         time_s=time if np.isfinite(time := numbers["time_s"].to_numpy(np.float64)).all() else np.zeros(len(position)),
         remarks=(f"{lost} of {counted(len(position), 'point')} without a position near the site.",) if lost else (),
     )
+
+
+def _buried(points: Targets, site: Site) -> list[str]:
+    """Return a remark about points that are below the ground."""
+    east, north, up = points.position_m[points.known].T
+    count = int((up < site.ground_under_m(east, north)).sum())
+    return [f"{count} of {counted(len(up), 'point')} below the ground, where no path arrives."] if count else []
 
 
 def _route(where: Path, site: Site, options: TargetOptions) -> Targets:

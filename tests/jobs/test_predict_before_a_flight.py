@@ -56,6 +56,14 @@ def test_points_outside_the_area_of_the_site_are_counted(place: Path) -> None:
     assert "25 % of the points are outside the area of the site" in predicted(place)[1]["warnings"][0]
 
 
+def test_points_and_heights_below_the_ground(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "points.csv").write_text(POINTS + "100,0,-5\n")
+    assert any(text.startswith("1 of ") and "below the ground" in text for text in predicted(place)[1]["warnings"])
+    for command in ("predict", "plan"):
+        assert main([command, str(place / "site.yaml"), "-o", str(place / "low"), "--height", "-40"]) == 2
+        assert "'--height': expected greater than or equal to 0.1" in capsys.readouterr().err
+
+
 def test_options_replace_carrier_and_power_of_the_site(place: Path) -> None:
     level = predicted(place)[0]["level_db"].to_numpy()
     changed = predicted(place, "--tx-power-dbm", "20", "--carrier-ghz", "2.5")[0]["level_db"].to_numpy()

@@ -1,7 +1,7 @@
 """Reading of third-party files in native formats (HDF5, GeoTIFF), in a child process that cannot open other files.
 
-Libraries of these formats are C code that a file can lead to other files (external storage and links, virtual data
-sets, VRT), into endless loops, and sometimes beyond the end of a buffer. The child gets the bytes of the file, loads
+Libraries of these formats are C code. A malicious file can make them open other files (external storage and links,
+virtual data sets, VRT), run forever, or read beyond the end of a buffer. The child gets the bytes of the file, loads
 its library, and then gives up its rights. It cannot create any further descriptor (RLIMIT_NOFILE 0: no file, socket or
 process pipe), use more than ``_MOST_MEMORY``, or more than ``SECONDS`` of processor time. Only then does it read the
 bytes. The result is a list of plain arrays.

@@ -990,7 +990,7 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
 
 
 def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
-    """Return a limit with its words, or None if measured levels beyond it show that nothing is clipped."""
+    """Return the cause for a limit of the levels, or None if measured levels beyond it show that nothing is clipped."""
     if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
         return None
     name, words, step = _LIMITS[side]

@@ -223,7 +223,7 @@ class GainModel:
     own_scales_db: tuple[tuple[str, float, float], ...] = ()
 
     def scales_db(self, *names: str) -> tuple[float, float]:
-        """Return the standard deviations of nuisance and noise of the first name that has its own values [dB]."""
+        """Return the standard deviations of nuisance and noise [dB]: those of the first name with separate values."""
         known = {name: (own, noise) for name, own, noise in self.own_scales_db}
         return next((known[name] for name in names if name in known), (self.own_sd_db, self.noise_sd_db))
 

@@ -92,7 +92,7 @@ def channel_rank(h: ArrayLike, k: float) -> IntArray:
     h : array_like, complex, (..., n_rx, n_tx)
         Channel matrices, in any scale.
     k : float
-        Ratio of singular values, >= 1 (the paper's K = 10, 100, 1000; its "10, 20, 30 dB").
+        Ratio of singular values, >= 1 (K = 10, 100, 1000 in the paper, also called 10, 20, 30 dB there).
 
     Returns
     -------

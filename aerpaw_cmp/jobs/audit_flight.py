@@ -46,7 +46,7 @@ _ATTITUDE_TOLERANCE_RAD = 1e-6
 # Links of all series together, at least three per series. Each takes about 0.1 s.
 _REFERENCE_LINKS_AT_MOST = 64
 
-_TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
+_TIMES = "Time: the part of the replay for the audited links. Time of the reference: with its start."
 
 # Errors that an audit of the replay cannot detect.
 _NOT_COVERED = (

@@ -42,7 +42,7 @@ def open_flight(
     overrides: Mapping[str, Any] | None = None,
     flight: str | None = None,
 ) -> Flight:
-    """Read a flight.yaml and its logs, or a flight.h5 with the settings that a draft of it would have.
+    """Read a flight.yaml and its logs, or a flight.h5, whose settings are then drafted.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ class ReplayedFlight:
         Returns
         -------
         xarray.DataTree
-            A node ``<tower>/<channel>`` per series. ``time`` is UTC and has the known poses.
+            A node ``<tower>/<channel>`` per series. ``time`` contains the UTC times of samples with a known pose.
 
         Raises
         ------

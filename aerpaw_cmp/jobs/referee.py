@@ -530,8 +530,9 @@ def _sentence(given: ForeignPrediction, series: Entries, common: Entries, means:
         verdicts = Counter(entry["differences"][referee.OURS].verdict for entry in common)
         decided = [f"significantly {kind} on {verdicts[kind]}" for kind in ("better", "worse") if verdicts[kind]]
         text += (
-            f", ray tracing {errors[referee.OURS]:.1f} dB on the same samples ({counted(len(common), 'channel')}). It "
-            f"is {' and '.join(decided) or 'on no channel significantly different from ray tracing'} (95 %)."
+            f", ray tracing {errors[referee.OURS]:.1f} dB on the same samples ({counted(len(common), 'channel')}). "
+            + (f"It is {' and '.join(decided)}" if decided else "The difference is not significant on any channel")
+            + " (95 %)."
         )
     else:
         text += ". Ray tracing has no score there."

@@ -241,7 +241,7 @@ def _split(name: str, what: Meaning | None) -> tuple[str, str]:
 
 
 def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
-    """Return the meanings of columns, with a place for each level and identity that share their other words.
+    """Return the meanings of columns. Levels and identities whose names have the same other words share a place.
 
     A place with several identities, such as "PCI A" and "PCI B", has several cells: "RSRP A" is the level of the first.
 

@@ -130,7 +130,7 @@ def read(
     reader : str, optional
         Name of the reader (``aerpaw-cmp formats`` lists all readers). Default: detected by content.
     time_origin : str, optional
-        Time of zero for logs with relative times.
+        Date and time at which the times of logs with relative times are zero.
     options
         Further fields of :class:`aerpaw_cmp.logs.readers.ReadOptions`.
 

@@ -303,7 +303,7 @@ class OrdinaryKriging:
     values_ : (places, fields)
         Values at these positions.
     place_ : (samples,) int
-        Number of the position of each sample.
+        Index into ``points_m_`` of each sample.
     sill_ : (fields,)
         Sample variance of each field, v^2.
 
@@ -689,7 +689,7 @@ class TrendKriging:
     --------
     >>> places = [[0.0, 0.0], [60.0, 0.0], [0.0, 60.0], [60.0, 60.0]]
     >>> model = TrendKriging(lambda d: np.exp(-d / 50.0)).fit(places, [1.0, 3.0, 5.0, 7.0], [0.0, 1.0, 2.0, 3.0])
-    >>> model.predict([[200.0, 0.0]], [10.0])[0].round(9).tolist()  # twice the trend and one
+    >>> model.predict([[200.0, 0.0]], [10.0])[0].round(9).tolist()  # 2 times the trend, plus 1
     [21.0]
     """
 

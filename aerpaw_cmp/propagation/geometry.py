@@ -594,7 +594,7 @@ class Array:
     slant_rad : (elements,)
         Slant of each element: 0 vertical, pi/2 horizontal.
     patterns : tuple of Pattern
-        One per element, or one shared by all.
+        One pattern per element, or one for all elements.
     mount : (3, 3)
         Rotation of the device frame in its carrier (tower: site axes; UAV: aircraft body, forward-left-up).
     """

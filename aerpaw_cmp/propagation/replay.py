@@ -376,7 +376,7 @@ class Replay:
     samples : int
         Rays per tower; 0 for an engine without rays.
     samples_reason : str
-        Reason for this number of rays, if pilot searches determined it.
+        Reason for this number of rays, if trial searches determined it.
     surfaces : Surfaces, optional
         Materials and triangles of the faces, if the site is a scene of triangles.
     """
@@ -712,9 +712,9 @@ def trace(
     loss : callable, optional
         Further loss per path [dB], such as foliage.
     samples : int or "auto"
-        ``sionna`` only: rays per tower; "auto" raises the number until two pilot searches agree.
+        ``sionna`` only: rays per tower; "auto" raises the number until two trial searches agree.
     diffraction : {"none", "edges"}
-        Paths over one edge of a building, with the ground on either side (:mod:`aerpaw_cmp.propagation.edges`).
+        ``edges``: also paths over one edge of a building (:mod:`aerpaw_cmp.propagation.edges`).
 
     Returns
     -------

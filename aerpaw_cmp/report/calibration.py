@@ -81,7 +81,7 @@ HELPS: dict[str, tuple[str, str]] = {
         "The difference of {effect:+.1f} dB is not significant (95 %: {low:+.1f} to {high:+.1f} dB).",
         "add flights with different headings",
     ),
-    "no interval": ("The difference is {effect:+.1f} dB; no interval from two flights.", "add a third flight"),
+    "no interval": ("The difference is {effect:+.1f} dB; an interval requires three flights.", "add a third flight"),
 }
 
 # Sentence and next step, by the verdict of :func:`~aerpaw_cmp.compare.verdict.antenna_or_place` on the UAV's frame.

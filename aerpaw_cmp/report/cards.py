@@ -213,7 +213,7 @@ _SETTING_SHOWN = 300
 def settings_card(made: Any, *settings: Mapping[str, Any], fold: bool = False) -> Card:
     """Return the card of settings, versions and times. ``made`` has the fields of :class:`~.page.Made`."""
     rows = [(key, cut(text, _SETTING_SHOWN)) for part in settings for key, text in flat(part)]
-    checked = Table(caption="The checked settings.", columns={"Key": HEAD, "Value": TEXT}, rows=rows)
+    checked = Table(caption="All settings, with their defaults.", columns={"Key": HEAD, "Value": TEXT}, rows=rows)
     software = Table(caption="Software.", columns={"Name": HEAD, "Version": TEXT}, rows=list(made.versions.items()))
     stages = list(made.stages_s.items())
     seconds = Table(caption="Seconds per stage.", columns={"Stage": HEAD, "Seconds": 2}, rows=stages)

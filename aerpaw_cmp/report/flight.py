@@ -258,7 +258,8 @@ def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption
     ]
     return Table(
         caption=caption, rows=rows,
-        columns={f"From ({unit})": TEXT, "To": TEXT, "East [m]": 0, "North [m]": 0, "Up [m]": 0, "Mean [dB]": 1},
+        columns={f"From ({unit})": TEXT, "To": TEXT, "East [m]": 0, "North [m]": 0, "Up [m]": 0,
+                 "Mean residual [dB]": 1},
     )  # fmt: skip
 
 
@@ -444,12 +445,13 @@ def _audited_fields(f: FieldAudit | None) -> list[Table]:
     rows = [
         ("Sionna RT, per path, both slants", f"{counted(f.paths, 'path')}, phases of {number(f.phases, 0)}",
          number(f.power_max_db, 3, "dB"), number(f.power_rms_db, 4, "dB"), number(f.phase_max_rad, 5, "rad"),
-         number(f.phase_rms_rad, 6, "rad"), f"RSS of a link: {number(f.link_rss_max_db, 3)} dB"),
+         number(f.phase_rms_rad, 6, "rad"), f"largest difference of RSS: {number(f.link_rss_max_db, 3)} dB"),
         ("Second implementation, per element pair",
          f"{counted(f.reference_links, 'link')}, {counted(f.reference_paths, 'path')}",
          number(f.rss_max_error_db, 6, "dB"), "", "", "",
-         f"H: {f.h_max_error:.1e} of its size; other rank: {number(f.rank_differs, 0)}; missing, impossible paths: "
-         f"{number(f.missing_paths, 0)}, {number(f.phantom_paths, 0)}"),
+         f"largest difference of H: {f.h_max_error:.1e} of its size; links with another rank: "
+         f"{number(f.rank_differs, 0)}; paths: {number(f.missing_paths, 0)} missing, "
+         f"{number(f.phantom_paths, 0)} impossible"),
         ("Attitude, computed a second time", f"{number(f.attitude_rows, 0)} telemetry rows", "", "",
          f"{f.attitude_max_rad:.1e} rad", "", ""),
     ]  # fmt: skip
@@ -480,7 +482,7 @@ def inputs_card(data: ReportData) -> Card:
         columns={"File": HEAD, "Reader": TEXT, "Lines": 0, "Accepted": 0, "Rejected": 0, "Blank": 0, "SHA-256": "hash"},
         rows=[
             (Markup('{} <span class="small">{}</span>').format(f.path, f"({f.role})" if f.role else ""),
-             *((f.reader, f.lines, f.accepted, f.rejected, f.blank) if f.reader else ("no log", "", "", "", "")),
+             *((f.reader, f.lines, f.accepted, f.rejected, f.blank) if f.reader else ("not a log", "", "", "", "")),
              Markup('<span title="{}">{}…</span>').format(f.sha256, f.sha256[:16]))
             for f in data.inputs
         ],

@@ -240,8 +240,8 @@ def audit_summary(audit: AuditResult) -> str:
     texts = [f"Audit of {counted(audit.links, 'link')} against {audit.reference}: {audit_paths(audit)}."]
     if fields is not None:
         texts.append(
-            f"Field: {counted(fields.paths, 'path')} against {audit.reference}'s own coefficients, worst "
-            f"{fields.power_max_db:.2g} dB and {fields.phase_max_rad:.2g} rad."
+            f"Field of {counted(fields.paths, 'path')} against the coefficients of {audit.reference}: largest "
+            f"differences {fields.power_max_db:.2g} dB and {fields.phase_max_rad:.2g} rad."
         )
         texts.append(f"Checks failed: {count(len(fields.failures))}.")
     if audit.read_from_cache_of:

@@ -72,9 +72,9 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
         columns={"Route": HEAD, "SD [dB]": 1, "Length [km]": 1, "Time [min]": 1, "May be flown": TEXT},
         rows=[(c["name"], c["sd_db"], c["length_m"] / 1000, c["minutes"], c["refused"] or "yes")
               for c in data.candidates],
-        notes=["The number is the error to expect of a predicted level about the mean of a later flight, without that "
-               "flight's own shadowing, fading and noise. It depends on positions and headings alone, not on the "
-               "levels that will be measured. Use it to choose a flight. Routes whose single "
+        notes=["The SD is the expected error of the levels that are predicted for a later flight, after one offset, "
+               "without the shadowing, fading and noise of that flight. It depends on positions and headings, not on "
+               "the levels that will be measured. Use it to choose a flight, not single waypoints: routes whose "
                "waypoints were chosen by it were not better than a lawnmower of the same length."],
     )  # fmt: skip
     curve = Table(

@@ -54,7 +54,8 @@ AGAINST_FREE_SPACE = {
     ),
     "no interval": ("The flight is too short for an interval of the difference from free space.", ""),
     "two flights": (
-        "On held-out {over} the RMSE differs from free space by {effect:+.1f} dB; no interval from two flights.", ""
+        "On held-out {over} the RMSE differs from that of free space by {effect:+.1f} dB; an interval requires three "
+        "flights.", ""
     ),
 }  # fmt: skip
 

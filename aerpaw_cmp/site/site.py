@@ -168,7 +168,7 @@ class Site:
     notes : tuple of str
         Remarks for the report.
     disagreements : tuple of str
-        Clauses about ground heights of the site file that its elevation model contradicts.
+        Warnings about ground heights of the site file that its elevation model contradicts.
     takeoff_ground_m : float
         Height of the take-off point, which is the zero of ``altitude_m`` in logs.
     ground_above_sea_m : float or None
@@ -214,7 +214,7 @@ class Site:
         This is the height of the terrain if it is known. Otherwise it is the ground height of the nearest tower, or in
         a scene that of the take-off point.
 
-        The ground height of a tower counts only up to 0, because the ground between towers is lower and a UAV may be
+        A ground height of a tower above 0 is taken as 0, because the ground between towers is lower and a UAV may be
         there.
         """
         ground = np.full(len(east_m), self.takeoff_ground_m if self.scene is not None else 0.0)

@@ -594,7 +594,7 @@ def _split_places(sheet: Sheet) -> None:
 def of_readings(
     lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
 ) -> Sheet:
-    """Return the table of readings without a separator, with all other lines as comments unless they are rejected.
+    """Return the table of readings without a separator. All other lines are comments unless they are rejected.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ def is_header(names: list[str]) -> bool:
 
 
 def is_track_header(names: list[str]) -> bool:
-    """Check whether there is a position and a time among the names, and no quantity of a radio."""
+    """Check whether the names contain a position and a time, but no quantity of a radio."""
     known = _quantities(names)
     return ({*_pose.PLACE[:2]} <= known or "grid" in known) and _has_time(names) and not has_radio(names)
 

@@ -64,7 +64,7 @@ def test_two_flights_give_no_interval_as_in_a_calibration() -> None:
     """However many samples they have: 600 independent ones would bound the difference to some tenths of a decibel."""
     errors = {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}
     words = first_words(correction(LEARNED, errors, 3.0, ("a", "b")), 0.0, 4.2, 7.5)
-    assert re.search(r"differs from free space by −?-?[23]\.\d dB; no interval from two flights", words)
+    assert re.search(r"differs from that of free space by −?-?[23]\.\d dB; an interval requires three flights", words)
     assert "95 %" not in words
     single = first_words(correction(LEARNED, errors, 3.0, ("a",)), 0.0, 4.2, 7.5)
     assert "On held-out blocks of the flight it is" in single

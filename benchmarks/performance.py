@@ -25,7 +25,7 @@ AXES = {
     "towers": ("Towers", "replay of 10 000 poses, 4 x 4 elements, 12 buildings, depth 2"),
     "faces": (
         "Faces of buildings",
-        "paths and fields of 100 poses of one tower, depth 2, in an area that grows with the faces",
+        "paths and fields of 100 poses of one tower, depth 2, the area grows with the number of buildings",
     ),
     "samples": ("Samples of one channel", "comparison with all intervals, without replay"),
     "report": ("Samples of a flight", "complete report, two channels, without audit"),
@@ -254,7 +254,7 @@ def country(history: list[dict[str, Any]]) -> list[str]:
     ]  # fmt: skip
     for row in result["extrapolated"]:
         out.append(
-            f"- **{number(row['receivers'])} receivers**, from the slopes between the last two rows: "
+            f"- **{number(row['receivers'])} receivers**, extrapolated from the last two rows: "
             f"{row['wall_s'] / 3600:.1f} h, {row['store_mib'] / 1024:.0f} GiB in {number(row['files'])} files, first "
             f"process {number(row['first_mib'])} MiB and {number(row['first_cpu_s'])} s of processor time."
         )

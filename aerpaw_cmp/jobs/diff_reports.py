@@ -162,19 +162,29 @@ def _read_metrics(place: Path) -> dict[str, Any]:
         content = json.loads(read_bounded(file, LARGEST_TABLE, "metrics.json"))
     numbers = content if isinstance(content, dict) else {}
     missing = [key for key, kind in _NEEDED.items() if not isinstance(numbers.get(key), kind)]
-    if not missing and not all(isinstance(i, dict) and isinstance(i.get("path"), str) for i in content["inputs"]):
+    if not missing and not all(isinstance(i, dict) and _is_input(i) for i in content["inputs"]):
         missing = ["inputs"]
     towers = [] if missing else list(content["rss"].values())
-    if not all(isinstance(t, dict) and all(isinstance(n, dict) for n in t.values()) for t in towers):
+    if not all(isinstance(t, dict) and all(isinstance(n, dict) and _is_link(n) for n in t.values()) for t in towers):
         missing = ["rss"]
     if missing:
         raise InputError(
             f"has no {', '.join(map(repr, missing))}, which every report writes",
             expected="metrics.json of `aerpaw-cmp report`",
-            cause="a map, a calibration, or a report of another version: run the report again",
+            cause="a map, a calibration, an edited file, or a report of another version: run the report again",
             path=file,
         )
     return content  # type: ignore[no-any-return]
+
+
+def _is_input(entry: Mapping[str, Any]) -> bool:
+    return isinstance(entry.get("path"), str) and all(
+        isinstance(entry.get(name), (str, type(None))) for name in ("role", "sha256")
+    )
+
+
+def _is_link(entry: Mapping[str, Any]) -> bool:
+    return isinstance(entry.get("offset_db"), (int, float, type(None)))
 
 
 def _table(place: Path, kind: str, columns: Sequence[str]) -> Any:

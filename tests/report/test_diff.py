@@ -292,6 +292,8 @@ BAD = {
     "deep": (lambda f: (f / "metrics.json").write_text("[" * 100_000), r"metrics.json of a report", InputError),
     "other kinds": (lambda f: change_metrics(f, lambda m: m.update(inputs=[1])), r"has no 'inputs', which every report writes", InputError),
     "numbers for links": (lambda f: change_metrics(f, lambda m: m["rss"].update(LW1=[3])), r"has no 'rss', which every report writes", InputError),
+    "an edited offset": (lambda f: change_metrics(f, lambda m: m["rss"]["LW1"]["USRP1"].update(offset_db="many")), r"has no 'rss'.*an edited file", InputError),
+    "an edited input": (lambda f: change_metrics(f, lambda m: m["inputs"][0].update(sha256=[])), r"has no 'inputs'", InputError),
     "a torn json": (lambda f: (f / "metrics.json").write_text('{"flight": '), r"a truncated copy", InputError),
     "a campaign": (lambda f: (f / "metrics.json").rename(f / "campaign.json"), r"no metrics\.json.*campaign\.json", InputError),
     "nothing": (shutil.rmtree, r"there is no such folder; expected the folder of a report", InputError),

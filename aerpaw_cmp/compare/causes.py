@@ -120,7 +120,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             if any(either <= pair for pair in named):
                 continue
             lead = _lead(either, odds) / len(showing)
-            # an almost certain cause may leave an error without a certain name, so judge it beside that error as well
+            # an almost certain cause may leave an error without a certain name, so judge it with that error, too
             apart = (beside, best) if lead >= _CERTAIN else (beside,)
             if any(all(_explains(other, showing, lead, rest - either) for other in either) for rest in apart):
                 named[either] = showing

@@ -366,7 +366,7 @@ def error_spans(
         East, north, up [m].
     context : mapping of str to array_like (n,), optional
         Geometry of the samples. Known names: ``los`` (bool), ``foliage_m``, ``elevation_deg`` (from the tower),
-        ``height_m``, ``heading_deg``, ``coherent_minus_power_sum_db`` (how deep the simulation fades).
+        ``height_m``, ``heading_deg``, ``coherent_minus_power_sum_db`` (depth of the simulated fades).
     window_s : float
         Averaging window of the residual [s].
     threshold_db : float, optional

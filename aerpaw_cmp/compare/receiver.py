@@ -130,9 +130,9 @@ def score_forecast(
     measured : array_like, (n,)
         Reported rank, NaN if missing.
     probability : (n, ranks)
-        Forecast; NaN without one.
+        Forecast; NaN if there is none.
     decided : array_like, (n,)
-        Decided rank, 0 without a forecast.
+        Predicted rank; 0 if there is no forecast.
     constant : (ranks,)
         The constant forecast of the training flights (:func:`constant_forecast`).
 

@@ -25,7 +25,7 @@ NEAR_M = 150.0
 
 
 def paper_rows(outcome: MapOutcome) -> Iterator[PaperRow]:
-    """Yield all rows in the order of the paper, if the site has the paper's towers and the map its link budget.
+    """Yield all rows in the order of the paper, if the map has the towers and the link budget of the paper.
 
     Rows of the study are included only if the study was made.
     """

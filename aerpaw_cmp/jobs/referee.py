@@ -427,7 +427,7 @@ def _check_repeats(table: pd.DataFrame) -> None:
         raise InputError(
             f"{counted(len(twice), 'row')} with several levels at one {one}: {where}",
             expected="one row per tower, channel and time or position",
-            cause="two channels or two heights without their column",
+            cause="two channels or two heights, but no column for the channel or the height",
         )
 
 

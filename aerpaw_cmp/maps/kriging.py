@@ -159,7 +159,7 @@ def _fill_nearest(
     candidates: int,
     chosen: Neighbours,
 ) -> IntArray:
-    """Fill the rows ``todo`` from ``candidates`` per target. Return the rows whose tie reaches the last candidate."""
+    """Fill the rows ``todo`` from ``candidates`` per target. Return the rows that need more candidates."""
     samples_m, m = tree.data, chosen.index.shape[1]
     candidates = min(candidates, len(samples_m))
     # a list of ranks, because a plain 1 would drop an axis; the tree does not include the bound itself

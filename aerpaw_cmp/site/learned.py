@@ -514,7 +514,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
                 if place.exists() and (file, file_digest(place)) not in known and not _is_table(place):
                     raise UsageError(
                         "no calibration wrote this file",
-                        expected="another 'calibration:' name, or that file moved away",
+                        expected="another 'calibration:' name, or no file of this name in the folder",
                         path=place,
                     )
             for file, content in packed.items():

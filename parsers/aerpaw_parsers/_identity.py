@@ -321,7 +321,7 @@ def cell_names(sheet: _sheet.Sheet, base: Sequence[str], nr: bool) -> tuple[list
 
 
 def labels(sheet: _sheet.Sheet, columns: Sequence[int], about: dict[str, dict[str, Attribute]]) -> list[str]:
-    """Return a name per row made of identity columns, and add the attributes of each name to ``about``."""
+    """Return a name for each row from its identity columns, and add the attributes of each name to ``about``."""
     of_row, texts = [""] * len(sheet), {i: _named(sheet, i) for i in columns}
     # the same cell has the same name in 'CID 1' and 'CID 2'
     kinds = {i: m.quantity.name if (m := sheet.meanings[i]) else sheet.plain[i] for i in columns}

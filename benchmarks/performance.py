@@ -275,7 +275,7 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
     counts = [int(key.split("_")[1]) for key in row if key.startswith("pykrige_") and key[8:-2].isdigit()]
     sizes = {f"{number(n)}": str(n) for n in counts} | {f"{number(counts[-1])}, first call of a process": "first"}
     return [
-        f"Kriging of one field, 20 neighbours ({when}), processor seconds, the least of five runs in alternation. "
+        f"Kriging of one field, 20 neighbours ({when}), processor seconds, the smallest of five alternating runs. "
         "Totals include the set-up of each program. The first call of a process also includes its imports, and the "
         "last row includes neither:",
         "",

@@ -71,7 +71,7 @@ class ModelRow:
         False if the error is within 0.01 dB of that of an earlier model on every channel. The recommended model and
         that of the flight file are always distinct.
     elsewhere_db : (float, float), optional
-        RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
+        RMSE of the recommended model and of free space on other flights [dB], if other flights selected the model.
     """
 
     model: str
@@ -110,7 +110,7 @@ class ModelComparison:
         Index of the best model, of the best model with ray tracing, and of the recommended model. None if no models
         were compared.
     elsewhere_db : (float, float), optional
-        RMSE of the recommended model and of free space on other flights [dB], if these selected the model.
+        RMSE of the recommended model and of free space on other flights [dB], if other flights selected the model.
     """
 
     candidates: tuple[CandidateModel, ...]

@@ -558,8 +558,8 @@ _IN_A_ROW = 3
 class Schedule:
     """The order and times of the queries. If several are due, the first query has priority, then the longest waiting.
 
-    A modem that needs longer for an answer than the period of the first query is still asked the other queries: one
-    after every three polls of the first.
+    If a modem answers so slowly that the first query is always due, one of the other queries is sent after every three
+    polls of the first.
 
     After a short stall the missed polls follow each other immediately, with their true times in the records, so no
     answer is lost. After a long stall the schedule starts from now.

@@ -655,7 +655,7 @@ class _Line:
     places : tuple of Placement
         Nodes that the levels of this log fit.
     offsets_db : tuple of float
-        Offset that each level needs against free space.
+        Offset to add to the levels of each channel, so that their mean is that of free space [dB].
     """
 
     file: IngestedFile

@@ -156,7 +156,7 @@ class Occlusion:
     def _surrounded(
         self, start: FloatArray, end: FloatArray, enter: FloatArray, leave: FloatArray, pieces: IntArray
     ) -> bool:
-        """Check whether the pieces along which one segment runs fill the whole neighbourhood of one of its points.
+        """Check whether a segment is blocked: the pieces along which it runs surround one of its points completely.
 
         The segment runs along each of the ``pieces`` (n,) from the share ``enter`` to the share ``leave`` of its
         length.

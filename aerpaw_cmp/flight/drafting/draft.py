@@ -655,7 +655,7 @@ class _Line:
     places : tuple of Placement
         Nodes that the levels of this log fit.
     offsets_db : tuple of float
-        Offset to add to the levels of each channel, so that their mean is that of free space [dB].
+        Median of free space minus the level, for each channel [dB].
     """
 
     file: IngestedFile
@@ -834,7 +834,7 @@ def _doubt(entry: Mapping[str, Any], levels: Sequence[Stream], finder: NodeFinde
 def _offset_db(
     level: Stream, entry: Mapping[str, Any], nodes: Mapping[str, FloatArray], context: _Context
 ) -> float | None:
-    """Return the offset that a level needs against free space [dB]. None if its node is unknown."""
+    """Return the median of free space minus the level [dB]. None if the node of the level is unknown."""
     if context.finder is None or level.kind != "rss":
         return None
     cell = entry.get("cells", {}).get(_cell_of(level))

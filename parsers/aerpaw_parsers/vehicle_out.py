@@ -102,6 +102,7 @@ def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
     place = {f"{name}_deg": number[name] for name in ("latitude", "longitude")} | {"altitude_m": number["altitude"]}
     latitude, longitude, altitude = place.values()
     no_fix = (number["fix"] < 2) | (np.fmin(longitude, latitude) < _INVALID_POSITION) | (altitude < -998.5)
+    no_fix |= (latitude == 0) & (longitude == 0)
     rows.mark(no_fix, "no_fix")
     outside = ~no_fix & ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(altitude) < 1e5))
     rows.mark(outside, "position_out_of_range")

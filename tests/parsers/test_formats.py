@@ -78,6 +78,7 @@ def test_all_generations_of_telemetry_agree(data: bytes) -> None:
         ("-78", "35", "100000", "3", "position_out_of_range"),
         ("-78", "35", "-998.6", "3", "no_fix"),
         ("-901", "35", "1", "3", "no_fix"),
+        ("0.0", "0.0", "1", "3", "no_fix"),
         ("-78", "35", "1", "1", "no_fix"),
     ],
 )

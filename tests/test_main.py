@@ -10,7 +10,7 @@ import pytest
 
 import aerpaw_cmp
 from aerpaw_cmp import __main__ as program
-from aerpaw_cmp.common.errors import CheckError, InputError, UsageError
+from aerpaw_cmp.common.errors import CheckError, InputError, UsageError, next_step, typed
 from aerpaw_cmp.common.text import COMMANDS
 from aerpaw_cmp.common.versions import tool_version
 
@@ -100,7 +100,12 @@ def raising(error: BaseException):
         (
             UsageError("unknown key 'sight'", path="f.yaml", line=3),
             2,
-            "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'. Next: correct the value and run the same command ",
+            "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'. Next: 'aerpaw-cmp report --help' lists the options\n",
+        ),
+        (
+            UsageError("spacing 0 m"),
+            2,
+            "aerpaw-cmp: spacing 0 m. Next: correct the options and run the same command ('aer",
         ),
         (UsageError("Got unexpected extra argument(s) (b.yaml)"), 2, "Next: the same command without b.yaml\n"),
         (InputError("the file is empty", path="a.txt"), 3, "aerpaw-cmp: a.txt: the file is empty. Next: 'ls "),
@@ -120,6 +125,36 @@ def test_one_message_and_the_exit_code(error: BaseException, code: int, said: st
     assert out == ""
     assert said in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a b.txt", "März", "it's", "a'\"$(date)`", "a\\b !"])
+def test_a_typed_path_is_one_word_of_the_shell(name: str) -> None:
+    assert (
+        subprocess.run(["sh", "-c", f"printf %s {typed(name)}"], capture_output=True, check=True).stdout
+        == name.encode()
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "arguments", "step"),
+    [
+        (InputError("there is no such log", path="LW1/lo.txt"), "report my.yaml", "replace lo.txt by log.txt in my.yaml and run"),
+        (InputError("the file does not exist", path="LW1/lo.txt"), "ingest LW1/lo.txt", "the same command with LW1/log.txt"),
+        (UsageError("a folder", expected="a YAML file", path="LW1"), "report my.yaml --with LW1", "the same command with LW1.yaml"),
+        (UsageError("not YAML", path="LW1/log.txt"), "report LW1/log.txt", "correct log.txt or name another file"),
+        (UsageError("named twice", path="my.yaml"), "calibrate my.yaml my.yaml", "the same command with my.yaml once"),
+        (UsageError("unknown key", path="my.yaml", line=3), "report my.yaml", "fix my.yaml, line 3, and run"),
+        (InputError("no table", path="LW1.yaml"), "report my.yaml --against LW1.yaml", "the same command with the folder ."),
+        (InputError("its own logs", path="LW1"), "report my.yaml --against LW1/", "name another prediction and run"),
+        (UsageError("changed (SHA-256 in its first line)", path="my.yaml"), "report my.yaml", "copy my.yaml again"),
+    ],
+)  # fmt: skip
+def test_a_next_step_can_be_typed(error, arguments: str, step: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "LW1").mkdir()
+    for name in ("my.yaml", "LW1.yaml", "LW1/log.txt"):
+        (tmp_path / name).touch()
+    assert next_step(error, arguments.split()).startswith(step)
 
 
 def test_a_fault_of_ours_is_called_one(command_line, capsys, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ The last part of every message is the command or edit to try after a failure.
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -55,6 +56,20 @@ def printable(text: str) -> str:
     red: \x1b[31m
     """
     return "\n".join(one_line(line) for line in text.split("\n"))
+
+
+def typed(path: str | Path) -> str:
+    """Return a path as it is typed in a command line: in quotes if it contains spaces or special characters.
+
+    Examples
+    --------
+    >>> print(typed("LW1/a.txt"), typed("Lake Wheeler/a.txt"))
+    LW1/a.txt "Lake Wheeler/a.txt"
+    """
+    text = one_line(str(path))
+    if re.fullmatch(r"[\w@%+=:,./~-]+", text):
+        return text
+    return shlex.quote(text) if re.search(r'["$`\\!]', text) else f'"{text}"'
 
 
 def add_note(error: BaseException, text: str) -> None:
@@ -340,18 +355,30 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if isinstance(error, OutputError) or re.search(r"after -o\b|-o NAME|a new name", error.expected or ""):
         return "the same command with another name after -o"
     if place is not None and (reader := re.search(r"'(aerpaw-cmp [a-z]+) FILE' reads", error.found)):
-        return f"'{reader[1]} {one_line(str(place))}'"
+        return f"'{reader[1]} {typed(place)}'"
+    if "SHA-256 in its first line" in error.found:
+        return f"copy {one_line(Path(str(place)).name)} again from the unchanged file, or calibrate again"
     if error.found == "not a regular file":
-        return f"'ls -l {one_line(str(place))}' shows what is there"
+        return f"'ls -l {typed(str(place))}' shows what is there"
+    predictions = [Path(last) for option, last in pairwise(arguments) if option == "--against"]
+    if place is not None and place in predictions and _exists(place):
+        if place.suffix in _SETTINGS:
+            return f"the same command with the folder {typed(place.parent)}"
+        other = f"correct {one_line(place.name)} (docs/referee.md lists the columns)"
+        return f"{'name another prediction' if place.is_dir() else other} and run the same command"
+    if place is not None and [Path(word) for word in arguments].count(place) > 1:
+        return f"the same command with {typed(place)} once"
     if place is not None and place.suffix in _SETTINGS and _exists(place) and words[:1] != ["ingest"]:
         line = "" if error.line is None else f", line {error.line},"
         return f"fix {one_line(place.name)}{line} and run the same command"
     if place is not None and error.expected == "a YAML file" and _exists(place) and place.is_dir():
-        settings = sorted(path for path in place.iterdir() if path.suffix in _SETTINGS)
+        # a folder of 'calibrate' is next to the file with its settings
+        beside = [path for path in (place.parent / f"{place.name}.yaml",) if _exists(path)]
+        settings = beside or sorted(path for path in place.iterdir() if path.suffix in _SETTINGS)
         if len(settings) == 1:
-            return f"the same command with {one_line(str(settings[0]))}"
+            return f"the same command with {typed(settings[0])}"
         if not settings and words[:1] in _OF_LOGS:
-            return f"'aerpaw-cmp ingest {one_line(str(place))} --draft flight.yaml' writes one from its logs"
+            return f"'aerpaw-cmp ingest {typed(place)} --draft flight.yaml' writes one from its logs"
     if extra := re.match(r"Got unexpected extra argument\S* \((.+)\)", error.found):
         return f"the same command without {one_line(extra[1])}"
     settings_file = next((word for word in arguments if word.endswith(_SETTINGS)), None)
@@ -363,14 +390,14 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "'aerpaw-cmp doctor' lists the serial ports"
     if re.match("Missing|No such option", error.found):
         return f"'{command} --help' lists the options"
-    if place is None or not isinstance(error, InputError):
-        return f"correct the value and run the same command ('{command} --help' describes the options)"
+    if place is None:
+        return f"correct the options and run the same command ('{command} --help' describes them)"
+    if not isinstance(error, InputError) and (not _exists(place) or "--" in f"{error.expected} {error.cause}"):
+        return f"'{command} --help' lists the options"
     if not _exists(place):
         return _nearest(place, arguments)
-    if str(place) in (last for option, last in pairwise(arguments) if option == "--against"):
-        return f"correct {one_line(place.name)} (docs/referee.md lists the columns) and run the same command"
     if not place.is_file():
-        return f"'ls -l {one_line(str(place))}' shows what is there"
+        return f"'ls -l {typed(place)}' shows what is there"
     if words[:1] == ["ingest"]:
         # a recognised file, or a hint about columns, already contains the next step
         unknown = "no reader recognises" in error.found and "--map" not in (error.cause or "")
@@ -378,7 +405,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if "--tower NAME=" in (error.expected or ""):
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
     if words[:1] in _OF_LOGS and re.search(r"\blogs?\b|\breaders?\b", f"{error.found} {error.expected} {error.cause}"):
-        return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file contains"
+        return f"'aerpaw-cmp ingest {typed(place)}' shows what the file contains"
     return f"correct {one_line(place.name)} or name another file, and run the same command"
 
 
@@ -406,5 +433,5 @@ def _nearest(place: Path, arguments: Sequence[str]) -> str:
         where = settings[0] if len(settings) == 1 else "the file that names it"
         return f"replace {one_line(place.name)} by {one_line(near[0])} in {one_line(where)} and run the same command"
     if near:
-        return f"the same command with {one_line(str(folder / near[0]))}"
-    return f"'ls {one_line(str(folder))}' shows the names there"
+        return f"the same command with {typed(folder / near[0])}"
+    return f"'ls {typed(folder)}' shows the names there"

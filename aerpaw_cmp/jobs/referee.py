@@ -152,7 +152,8 @@ def read_foreign(path: Path, data: FlightData, near_m: float = AGAINST_DISTANCE_
     UsageError
         If ``predict`` learned the prediction from the logs of the flight.
     """
-    file = path / "prediction.csv" if (path / "prediction.csv").is_file() else path
+    tables = (path / name for name in ("prediction.csv", "prediction.nc"))
+    file = next((table for table in tables if table.is_file()), path)
     with about_file(path):
         if file.is_dir():
             digest, (frame, about) = "", _emulated(path, data)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.cf import library
-from ..common.errors import UsageError, noting_interrupts
+from ..common.errors import UsageError, noting_interrupts, typed
 from ..common.files import cache_folder
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import PlannedStage
@@ -549,6 +549,12 @@ def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
             )
 
 
+def calibrate_command(path: Path, further: Sequence[Path], into_site: str | None) -> str:
+    """Return the command that learns the same again, with paths as the user typed them."""
+    words: list[str | Path] = [path, *further, *([] if into_site is None else ["--into-site", into_site])]
+    return f"aerpaw-cmp calibrate {' '.join(map(typed, words))}"
+
+
 def run_calibrate(
     path: Path,
     options: RunOptions = DEFAULT,
@@ -612,10 +618,9 @@ def run_calibrate(
         if settings.rank:
             with stages("rank"):
                 ranked = fit_rank(reports)
-        command = f"aerpaw-cmp calibrate {path.name}" + (f" --into-site {into_site}" if into_site is not None else "")
         calibrated = Calibrated(
             settings=settings, flights=tuple(flights), remarks=tuple(remarks), calibration=calibration, ranked=ranked,
-            command=command, campaigns=campaigns,
+            command=calibrate_command(path, further, into_site), campaigns=campaigns,
         )  # fmt: skip
         with output.filling() as place:
             metrics, text = write_files(calibrated, place, folder.name, stages.seconds)

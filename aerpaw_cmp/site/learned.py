@@ -30,7 +30,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from ..common.content import marks, trained_on
-from ..common.errors import InputError, UsageError, parsed, parsing
+from ..common.errors import InputError, UsageError, one_line, parsed, parsing
 from ..common.files import LARGEST_TABLE, inside, locked, read_bounded, write_whole
 from ..common.gaussian import Factor, gaussian_kernel
 from ..common.geodesy import azimuth_rad, elevation_rad
@@ -613,10 +613,11 @@ def read_table(path: Path, expected: str, written: Written | None = None) -> byt
     content = b"" if missing else read_bounded(path, LARGEST_TABLE, expected)
     if written is not None and hashlib.sha256(content).hexdigest() != written.sha256:
         found = "is missing" if missing else "is not the one that was learned"
+        copied = f"settings that were copied without the folder {one_line(path.parent.name)}"
         raise InputError(
             f"this table {found} (SHA-256 {written.sha256[:12]}...)",
             expected=f"{expected} as it was written; learn it again: {written.command}",
-            cause="an edited table, or a calibration that was killed while it wrote",
+            cause=copied if missing else "an edited table, or a calibration that was killed while it wrote",
             path=path,
         )
     if not content.startswith(b"\x1f\x8b"):

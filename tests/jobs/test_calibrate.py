@@ -17,7 +17,7 @@ from aerpaw_cmp.flight.settings import ArraySettings, FlightFile, LinkSettings, 
 from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights, recipe_of
 from aerpaw_cmp.jobs.calibration_files import learned_settings
 from aerpaw_cmp.jobs.options import RunOptions
-from aerpaw_cmp.jobs.run import run_calibrate
+from aerpaw_cmp.jobs.run import calibrate_command, run_calibrate
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.learned import read_sphere_csv
 from tests.jobs.calibrated import YAW_DEG, calibrated, past_sector_antenna, settings
@@ -82,6 +82,8 @@ def test_flight_files_by_themselves_are_learned_from_as_a_list_of_them_is(folder
     assert typed.calibration == "first"
     assert [Path(name).name for name in typed.flights] == listed.flights
     assert main(["calibrate", *(str(folder / name) for name in listed.flights), "--dry-run"]) == 0
+    again = calibrate_command(Path("May 1/flight.yaml"), [Path("2/flight.yaml")], "s.yaml")
+    assert again == 'aerpaw-cmp calibrate "May 1/flight.yaml" 2/flight.yaml --into-site s.yaml'
 
 
 def test_the_planted_antenna_is_in_the_file(folder: Path, metrics: dict) -> None:

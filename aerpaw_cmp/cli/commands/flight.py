@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from ...common.errors import typed
 from ...common.text import counted
 from ...jobs.options import AGAINST_DISTANCE_M, RunOptions
 from ..app import DryRun, Figures, Force, LogsRoot, command, output
@@ -271,4 +272,4 @@ def sample(
     if answered({"flight": str(flight)}):
         return
     show(f"flight: {flight}")
-    show(f"next: aerpaw-cmp report {flight}")
+    show(f"next: aerpaw-cmp report {typed(flight)}")

@@ -359,6 +359,15 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
                                       for near in best.parameters.near)  # fmt: skip
 
 
+@pytest.mark.parametrize(("share", "axis"), [(0, 0), (7, 1)])
+def test_the_correlation_time_of_an_absent_part_of_the_noise_changes_no_digit(share: int, axis: int) -> None:
+    """Otherwise rounding errors decide where the search for the likeliest noise goes on."""
+    residual = np.cumsum(np.random.default_rng(4).normal(size=200))
+    every = [noise.NoiseParameters(*np.roll([at, 2], axis).tolist(), share) for at in range(5)]
+    fits = [noise.fit_under_noise(residual, np.full((200, 1), 100.0), each, search=False) for each in every]
+    assert len({fit.log_likelihood for fit in fits}) == 1
+
+
 def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> None:
     """Twenty columns of noise lower the evidence.
 

@@ -20,6 +20,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
@@ -27,7 +28,17 @@ import numpy as np
 from ..common.units import AnyArray, BoolArray, FloatArray, Printed, wrap_degrees
 from .evidence import EPOCH, LEAST_BINS, MOST_FADING, PILE_DB, LevelEvidence, in_bins
 from .health import Judged, Step, level_of, step_of
-from .noise import LEAST_VARIANCE, START, NoiseFit, NoiseParameters, fit_under_noise, shift_in_masks, squares_of_halves
+from .noise import (
+    LEAST_VARIANCE,
+    START,
+    Columns,
+    NoiseFit,
+    NoiseParameters,
+    fit_under_noise,
+    log_likelihoods,
+    shifts_in_masks,
+    squares_of_halves,
+)
 from .result import Cause
 from .statistics import is_flat
 
@@ -47,7 +58,7 @@ _NEAR = 1.92
 _UNNAMED = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Trial:
     """A fault with its numbers, its effect on the level, and its words.
 
@@ -72,6 +83,11 @@ class Trial:
     fading: FloatArray | None = None
     estimate: tuple[float, float, float] = (math.nan, math.nan, math.nan)
     channels: int = 1
+
+    @cached_property
+    def designs(self) -> tuple[Columns, ...]:
+        """The columns for fits, which share their whitened values. Empty without columns."""
+        return () if self.columns is None else (Columns(self.columns),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -487,18 +503,19 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, searc
     """Fit offset and coefficients of some faults, with the given noise or with the likeliest one near it."""
     target = e.measured_db - e.predicted_db
     clipped = np.zeros(len(target), dtype=np.bool_)
-    columns, shown = [], np.ones(len(target))
+    shown = np.ones(len(target))
     for trial in trials:
         target = target if trial.change_db is None else target - trial.change_db
         clipped = clipped if trial.clipped is None else clipped | trial.clipped
-        columns += [] if trial.columns is None else [trial.columns]
         shown = shown if trial.fading is None else shown * trial.fading
-    design = np.column_stack([np.full(len(target), _OFFSET_DB), *columns])
     if clipped.all():
         return NoiseFit(-math.inf, target - target.mean(), START)
     link = ~clipped
     scale = shown[link]
-    fit = fit_under_noise(target[link] / scale, design[link] / scale[:, None], at, search)
+    designs = [_offset(len(target)), *(of for trial in trials for of in trial.designs)]
+    if not (link.all() and (scale == 1.0).all()):
+        designs = [Columns(of.values[link] / scale[:, None]) for of in designs]
+    fit = fit_under_noise(target[link] / scale, designs, at, search)
     likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
     residual[link] = fit.residual_db * scale
     if clipped.any():  # clipped levels do not depend on the link
@@ -507,6 +524,11 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, searc
         spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
         likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
     return NoiseFit(likelihood, residual, fit.parameters)
+
+
+@lru_cache(maxsize=4)
+def _offset(n: int) -> Columns:
+    return Columns(np.full((n, 1), _OFFSET_DB))
 
 
 _LEAST_SPREAD_DB = 0.2
@@ -535,8 +557,10 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         yield Trial(cost=_RARE / channels, channels=channels, change_db=backwards - e.predicted_db)
     if e.clock is not None and e.clock.shifted:
         return
-    lags = [*_LAGS_S, *np.arange(_LAGS_S[-1], length + _LAGS_S[0], 2.0 * _LAG_STEP_S)]
-    levels = np.array([np.interp((since - lag) % length, since, e.predicted_db) for lag in lags])
+    lags = np.append(_LAGS_S, np.arange(_LAGS_S[-1], length + _LAGS_S[0], 2.0 * _LAG_STEP_S))
+    shifted = since - lags[:, None]
+    shifted -= length * np.floor(shifted / length)
+    levels = np.interp(shifted, since, e.predicted_db)
     if (nearer := _nearer(e, levels)).any():
         best, cost = _likeliest(e, levels, possible=nearer)
         yield Trial(cost=cost, change_db=levels[best] - e.predicted_db)
@@ -552,7 +576,7 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
     if not pairs:
         return
     lags = [rate * (e.time_s - middle + (0.5 - begin) * length) for rate, begin in pairs]
-    levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in lags])
+    levels = np.interp(e.time_s - np.array(lags), e.time_s, e.predicted_db)
     if not (nearer := _nearer(e, levels)).any():
         return
     best, cost = _likeliest(e, levels, possible=nearer)
@@ -599,14 +623,23 @@ _LAGS_S = np.arange(-60.0, 61.0, _LAG_STEP_S)
 
 def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: NoiseParameters = START) -> Trial:
     """Return the trial with the likeliest of some values, and the range of values that are nearly as likely."""
-    likelihood = {value: _fitted(e, trial, at=at, search=False).log_likelihood for value, trial in trials.items()}
-    best, tried = max(likelihood, key=lambda value: likelihood[value]), sorted(trials)
+    tried = sorted(trials)
+    likelihood = _log_likelihoods(e, [trials[value] for value in tried], at)
     width = np.gradient(tried) if len(tried) > 1 else np.ones(1)
-    cost = trials[best].cost + _concentration(np.array([likelihood[value] for value in tried]), width)
-    near = [i for i, value in enumerate(tried) if likelihood[value] >= likelihood[best] - _NEAR]
+    best, cost = tried[int(likelihood.argmax())], _concentration(likelihood, width)
+    near = np.flatnonzero(likelihood >= likelihood.max() - _NEAR)
     low, high = max(near[0] - 1, 0), min(near[-1] + 1, len(tried) - 1)
     ends = 0.5 * (tried[near[0]] + tried[low]), 0.5 * (tried[near[-1]] + tried[high])
-    return dataclasses.replace(trials[best], estimate=(best, *ends), cost=cost)
+    return dataclasses.replace(trials[best], estimate=(best, *ends), cost=trials[best].cost + cost)
+
+
+def _log_likelihoods(e: LevelEvidence, trials: Sequence[Trial], at: NoiseParameters) -> FloatArray:
+    """Return the log likelihood (m,) of each of some trials under given noise."""
+    changes_db = [trial.change_db for trial in trials if trial.change_db is not None and trial.fading is None]
+    if len(changes_db) < len(trials):
+        return np.array([_fitted(e, trial, at=at, search=False).log_likelihood for trial in trials])
+    residuals = np.column_stack([e.measured_db - e.predicted_db - change_db for change_db in changes_db])
+    return log_likelihoods(residuals, [_offset(len(residuals))], at)
 
 
 def _concentration(log_likelihood: FloatArray, width: FloatArray) -> float:
@@ -1001,15 +1034,16 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     """Return a soft limit: the power of a floor is added, or the level approaches a ceiling."""
+    if (trial := _limited(e, limit, side)) is None:
+        return None
     # the median does not depend on the samples at the limit
     offset = float(np.median(e.measured_db - e.predicted_db))
     for _ in range(5):
         level = e.predicted_db + offset
         shown = limit + side * 10.0 * np.log10(1.0 + 10.0 ** (side * (level - limit) / 10.0))
         offset += float(np.mean(e.measured_db - shown))
-    trial = _limited(e, limit, side)
     # require enough samples: a prediction that fades too deeply at a few samples is not evidence of a limit
-    if trial is None or (side * (limit - level) > _FAR_DB).mean() < _LEAST_FAR:
+    if (side * (limit - level) > _FAR_DB).mean() < _LEAST_FAR:
         return None
     fading = 1.0 / (1.0 + 10.0 ** (side * (limit - level) / 10.0))
     return dataclasses.replace(trial, change_db=shown - level, fading=fading.clip(_LEAST_FADING))
@@ -1043,17 +1077,20 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
     residual = e.measured_db - e.predicted_db
     coarse = [(middle, width) for width in _WIDTHS_DEG for middle in np.arange(0.0, 360.0, 5.0).tolist()]
     shadows = _shadows(e, coarse)
-    for phi in _SEARCHED_PHI:
-        shift, _, gain = shift_in_masks(residual, shadows, phi)
-        inside = shadows.sum(axis=1)
-        possible = (inside >= LEAST_BINS) & (shadows.shape[1] - inside >= LEAST_BINS) & (shift < -_LEAST_LOSS_DB)
+    inside = shadows.sum(axis=1)
+    seen = (inside >= LEAST_BINS) & (shadows.shape[1] - inside >= LEAST_BINS)
+    shadows, coarse = shadows[seen], [sector for sector, possible in zip(coarse, seen, strict=True) if possible]
+    for phi, (shift, _, gain) in zip(_SEARCHED_PHI, shifts_in_masks(residual, shadows, _SEARCHED_PHI), strict=True):
+        possible = shift < -_LEAST_LOSS_DB
         if not possible.any():
             continue
         gain = np.where(possible, gain, -np.inf)
-        cost, (middle, width) = _concentration(gain, np.ones(len(gain))), coarse[int(np.argmax(gain))]
+        # a sector without samples is as unlikely as one without loss
+        cost = _concentration(gain, np.ones(len(gain))) + math.log(len(seen) / len(gain))
+        middle, width = coarse[int(np.argmax(gain))]
         around = [(middle + i, max(width + j, 2.0)) for i in range(-6, 7) for j in range(-8, 9)]
         finer = _shadows(e, around)
-        shift, error, gain = shift_in_masks(residual, finer, phi)
+        ((shift, error, gain),) = shifts_in_masks(residual, finer, (phi,))
         at = int(np.argmax(np.where(shift < -_LEAST_LOSS_DB, gain, -np.inf)))
         (middle, width), loss, reach = around[at], -float(shift[at]), 1.96 * float(error[at])
         first = (middle - 0.5 * width) % 360.0
@@ -1090,8 +1127,9 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     # the channels of a tower step at the same time
     channels = (e, *e.others)
     masks = [(_seconds(c, e)[None, :] >= e.time_s[starts][:, None]).astype(np.float64) for c in channels]
-    for phi in _SEARCHED_PHI:
-        steps = [shift_in_masks(c.measured_db - c.predicted_db, m, phi) for c, m in zip(channels, masks, strict=True)]
+    errors = [c.measured_db - c.predicted_db for c in channels]
+    shifts = [shifts_in_masks(error, m, _SEARCHED_PHI) for error, m in zip(errors, masks, strict=True)]
+    for steps in zip(*shifts, strict=True):
         (shift, error, _), gain = steps[0], np.sum([of for _, _, of in steps], axis=0)
         at = int(np.argmax(gain))
         instant = (e.start + np.timedelta64(round(float(e.time_s[starts[at]])), "s")).astype("datetime64[s]")

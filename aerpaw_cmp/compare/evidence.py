@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -165,8 +166,9 @@ def ages(time_s: AnyArray, level_db: FloatArray) -> FloatArray:
 
 def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
     """Return means of values (n,) or (n, k) over the ``count`` samples of each place."""
-    totals = np.apply_along_axis(lambda column: np.bincount(place, column), 0, values)
-    return np.asarray((totals.T / count).T)
+    if values.ndim > 1:
+        return np.column_stack([_mean(column, place, count) for column in values.T])
+    return np.asarray(np.bincount(place, values) / count)
 
 
 def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
@@ -175,11 +177,12 @@ def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray
     flat = np.cos(elevation)
     towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
     count = np.bincount(second)
-    at, towards = _mean(e.place_m[finite], second, count), _mean(towards, second, count)
+    # lists, because a distance of two short lists is faster than that of two arrays
+    at, towards = _mean(e.place_m[finite], second, count).tolist(), _mean(towards, second, count).tolist()
     number, begin = np.zeros(len(at), dtype=np.int64), 0
     for i in range(1, len(at)):
-        turned = np.linalg.norm(towards[i] - towards[begin]) > np.radians(_NEAR_DEG)
-        moved = turned or np.linalg.norm(at[i] - at[begin]) > _NEAR_M
+        turned = math.dist(towards[i], towards[begin]) > math.radians(_NEAR_DEG)
+        moved = turned or math.dist(at[i], at[begin]) > _NEAR_M
         begin = i if moved else begin
         number[i] = number[i - 1] + moved
     return number

@@ -9,16 +9,17 @@ Morris, J. R. Stat. Soc. A 139 (1976) 246, doi 10.2307/2345178, on sums of autor
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.units import FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseParameters:
+class NoiseParameters(NamedTuple):
     """The parameters of the noise, as indices into :data:`_SLOW`, :data:`_FAST` and :data:`_SLOW_SHARE`."""
 
     slow: int
@@ -28,9 +29,9 @@ class NoiseParameters:
     @property
     def near(self) -> list[NoiseParameters]:
         """These parameters, and all parameters with one index changed by one."""
-        places, sizes = (self.slow, self.fast, self.share), (len(_SLOW), len(_FAST), len(_SLOW_SHARE))
+        sizes = len(_SLOW), len(_FAST), len(_SLOW_SHARE)
         steps = [(0, 0), *((i, step) for i in range(3) for step in (-1, 1))]
-        moved = [tuple(p + step * (k == i) for k, p in enumerate(places)) for i, step in steps]
+        moved = [tuple(p + step * (k == i) for k, p in enumerate(self)) for i, step in steps]
         return [NoiseParameters(*m) for m in moved if all(0 <= p < size for p, size in zip(m, sizes, strict=True))]
 
     @property
@@ -81,8 +82,38 @@ def _whitening(parameters: NoiseParameters) -> tuple[tuple[float, float, float],
     return (1.0, -slow - fast, slow * fast), theta, math.sqrt(innovation)
 
 
-def fit_under_noise(residual: FloatArray, design: FloatArray, at: NoiseParameters, search: bool) -> NoiseFit:
-    """Fit the coefficients of a design (n, k) to a residual (n,) under noise with the given parameters.
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """One or more columns (n, k) of a design, which many fits share. For each noise, they are whitened only once."""
+
+    values: FloatArray
+    _white: dict[NoiseParameters, FloatArray] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def white(self, parameters: NoiseParameters) -> FloatArray:
+        """Return the columns (n, k) after the filter that whitens noise with the given parameters."""
+        if parameters not in self._white:
+            self._white[parameters] = _whitened(self.values, parameters)
+        return self._white[parameters]
+
+
+def _whitened(columns: FloatArray, parameters: NoiseParameters) -> FloatArray:
+    from scipy.linalg.lapack import dtbtrs  # scipy.signal takes 0.4 s to load
+
+    ahead, back, root = _whitening(parameters)
+    # assume that values before the first equal the first; Fortran order, because LAPACK solves by column
+    before = np.empty((len(columns) + 2, columns.shape[1]), order="F")
+    before[:2], before[2:] = columns[:1], columns
+    moved = ahead[0] * before[2:] + ahead[1] * before[1:-1] + ahead[2] * before[:-2]
+    moved[0] /= 1.0 - back
+    filter_ = np.ones((2, len(columns)), order="F")
+    filter_[1] = -back
+    white = dtbtrs(filter_, moved, uplo="L", overwrite_b=True)[0]
+    white[0] = root * columns[0]
+    return np.asarray(white)
+
+
+def fit_under_noise(residual: FloatArray, designs: Sequence[Columns], at: NoiseParameters, search: bool) -> NoiseFit:
+    """Fit the coefficients of some designs (n, k) to a residual (n,) under noise with the given parameters.
 
     Coefficients have a unit normal prior. The likelihood is integrated over the coefficients, and the residual uses
     their posterior means. The size of the noise is the most likely one.
@@ -91,7 +122,7 @@ def fit_under_noise(residual: FloatArray, design: FloatArray, at: NoiseParameter
     ----------
     residual : ndarray, (n,)
         Errors of consecutive means [dB].
-    design : ndarray, (n, k)
+    designs : sequence of Columns
         Effect of each coefficient.
     at : NoiseParameters
         Parameters of the noise, or the start of the search.
@@ -103,20 +134,35 @@ def fit_under_noise(residual: FloatArray, design: FloatArray, at: NoiseParameter
     NoiseFit
         Log likelihood, residual and parameters of the noise.
     """
-    from scipy.linalg.lapack import dtbtrs  # scipy.signal takes 0.4 s to load
+    tried = dict[NoiseParameters, tuple[float, FloatArray]]()
+    best, further = at, [*{at, *_STARTS}] if search else [at]
+    while further:
+        tried |= {parameters: _fits(residual[:, None], designs, parameters)[0] for parameters in further}
+        best = max(tried, key=lambda parameters: tried[parameters][0])
+        further = [parameters for parameters in best.near if search and parameters not in tried]
+    likelihood, coefficients = tried[best]
+    return NoiseFit(likelihood, residual - np.column_stack([of.values for of in designs]) @ coefficients, best)
 
-    n, columns = len(residual), np.column_stack([residual, design])
-    # assume that values before the first equal the first; Fortran order, because LAPACK solves by column
-    before = np.asfortranarray(columns[[0, 0, *range(n)]])
 
-    def fit(parameters: NoiseParameters) -> tuple[float, FloatArray]:
-        ahead, back, root = _whitening(parameters)
-        moved = ahead[0] * before[2:] + ahead[1] * before[1:-1] + ahead[2] * before[:-2]
-        moved[0] /= 1.0 - back
-        white = dtbtrs(np.array([np.ones(n), np.full(n, -back)]), moved, uplo="L", overwrite_b=True)[0]
-        white[0] = root * columns[0]
+def log_likelihoods(residuals: FloatArray, designs: Sequence[Columns], at: NoiseParameters) -> FloatArray:
+    """Return the log likelihood (m,) of each of m residuals (n, m) under the same noise and with the same designs."""
+    return np.array([likelihood for likelihood, _ in _fits(residuals, designs, at)])
+
+
+def _fits(
+    residuals: FloatArray, designs: Sequence[Columns], parameters: NoiseParameters
+) -> list[tuple[float, FloatArray]]:
+    """Return the log likelihood and the coefficients (k,) of each residual (n, m) with some designs."""
+    from scipy.linalg.lapack import dsyevd
+
+    n, targets = len(residuals), _whitened(residuals, parameters)
+    constant = math.log(_whitening(parameters)[2]) + parameters.log_prior
+    design = [columns.white(parameters) for columns in designs]
+    fits = []
+    for i in range(targets.shape[1]):
+        white = np.column_stack([targets[:, i : i + 1], *design])
         gram = white.T @ white
-        power, axes = np.linalg.eigh(gram[1:, 1:])
+        power, axes, _ = dsyevd(gram[1:, 1:])
         power, along = np.maximum(power, 0.0), axes.T @ gram[1:, 0]
         # the samples do not determine all directions of the coefficients
         fixed = power > 1e-9 * power[-1]
@@ -126,32 +172,33 @@ def fit_under_noise(residual: FloatArray, design: FloatArray, at: NoiseParameter
         mean = along / (power + variance)
         square = float(gram[0, 0] - along @ mean) / variance
         size = (n - len(power)) * math.log(variance) + float(np.log(variance + power).sum())
-        return -0.5 * (size + square) + math.log(root) + parameters.log_prior, axes @ mean
-
-    tried = {parameters: fit(parameters) for parameters in ({at, *_STARTS} if search else {at})}
-    best, last = max(tried, key=lambda parameters: tried[parameters][0]), None if search else at
-    while best != last:
-        last = best
-        tried |= {parameters: fit(parameters) for parameters in last.near if parameters not in tried}
-        best = max(tried, key=lambda parameters: tried[parameters][0])
-    likelihood, coefficients = tried[best]
-    return NoiseFit(likelihood, residual - design @ coefficients, best)
+        fits.append((-0.5 * (size + square) + constant, axes @ mean))
+    return fits
 
 
 LEAST_VARIANCE = 1e-12
 
 
-def shift_in_masks(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the level shift in each mask (m, n), its standard error and the gain in log likelihood."""
-    # subtract the prediction from the previous sample, so that slow fading is not mistaken for a shift
-    y = residual[1:] - phi * residual[:-1]
-    x = masks[:, 1:] - phi * masks[:, :-1]
-    y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)
-    power = np.einsum("ij,ij->i", x, x)
-    shift = np.divide(x @ y, power, out=np.zeros(len(x)), where=power > 1e-9)
-    left = np.maximum(y @ y - shift**2 * power, 1e-12)
-    error = np.sqrt(np.divide(left, len(y) * power, out=np.zeros(len(x)), where=power > 1e-9))
-    return shift, error, -0.5 * len(y) * np.log(left / max(float(y @ y), 1e-12))
+def shifts_in_masks(
+    residual: FloatArray, masks: FloatArray, phis: Sequence[float]
+) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Return the level shift in each mask (m, n), its standard error and the gain in log likelihood, for each phi."""
+    before, after = masks[:, :-1], masks[:, 1:]
+    sums = after.sum(axis=1), before.sum(axis=1)
+    squares = [np.einsum("ij,ij->i", *of) for of in ((after, after), (after, before), (before, before))]
+    shifts = []
+    for phi in phis:
+        # subtract the prediction from the previous sample, so that slow fading is not mistaken for a shift
+        y = residual[1:] - phi * residual[:-1]
+        y = y - y.mean()
+        # sums over the masks after the same subtraction
+        along = after @ y - phi * (before @ y)
+        power = squares[0] - 2.0 * phi * squares[1] + phi**2 * squares[2] - (sums[0] - phi * sums[1]) ** 2 / len(y)
+        shift = np.divide(along, power, out=np.zeros(len(power)), where=power > 1e-9)
+        left = np.maximum(y @ y - shift**2 * power, 1e-12)
+        error = np.sqrt(np.divide(left, len(y) * power, out=np.zeros(len(power)), where=power > 1e-9))
+        shifts.append((shift, error, -0.5 * len(y) * np.log(left / max(float(y @ y), 1e-12))))
+    return shifts
 
 
 def squares_of_halves(error: FloatArray, columns: FloatArray, memory: float) -> tuple[float, float]:

@@ -632,9 +632,10 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
     """Interpolate roll, pitch and yaw (rows, 3), known at times ``at``, as rotations (n, 3, 3) at times t."""
     from scipy.spatial.transform import Rotation, Slerp
 
-    # use only the rows around t, because ``t`` may be a small part of a long flight
-    part = slice(max(int(np.searchsorted(at, t.min(), side="right")) - 1, 0), int(np.searchsorted(at, t.max())) + 1)
-    at, attitude_deg = at[part], attitude_deg[part]
+    # use only the rows next to each time, because the times may be few in a long flight
+    before = np.searchsorted(at, t, side="right") - 1
+    rows = np.unique(np.clip([before, before + 1], 0, len(at) - 1))
+    at, attitude_deg = at[rows], attitude_deg[rows]
     matrices = rotation_from_aircraft(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
     if len(at) == 1:
         return np.broadcast_to(matrices, (len(t), 3, 3))

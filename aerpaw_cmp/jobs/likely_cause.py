@@ -363,14 +363,17 @@ class _Direct:
             return {}
         # a change varies slowly along the track, so interpolate between some poses
         at = np.unique(np.linspace(0, n - 1, min(n, _DISPLACED_POSES)).astype(np.int64))
-        position_m, rotation = poses.position_m[at], poses.rotation[at]
-        levels = {}
-        for radius, azimuth in product(_RADII_M, _AZIMUTHS_DEG):
-            turn = math.radians(azimuth)
-            place_m = self.place_m + radius * np.array([math.sin(turn), math.cos(turn), 0.0])
-            change = self.level(place_m=place_m, position_m=position_m, rotation=rotation, tower=True) - known_db[at]
-            levels[radius, azimuth] = known_db + np.interp(np.arange(n), at, change)
-        return levels
+        keys = [*product(_RADII_M, _AZIMUTHS_DEG)]
+        radii, turns = np.array(keys).T * [[1.0], [math.pi / 180.0]]
+        offset_m = np.column_stack([radii * np.sin(turns), radii * np.cos(turns), np.zeros(len(keys))])
+        level_db = self.level(
+            place_m=np.repeat(self.place_m + offset_m, len(at), axis=0),
+            position_m=np.tile(poses.position_m[at], (len(keys), 1)),
+            rotation=np.tile(poses.rotation[at], (len(keys), 1, 1)),
+            tower=True,
+        )
+        changes = level_db.reshape(len(keys), -1) - known_db[at]
+        return {key: known_db + np.interp(np.arange(n), at, change) for key, change in zip(keys, changes, strict=True)}
 
     def scaled_db(self, data: FlightData) -> dict[str, FloatArray]:
         """Return levels with the logged heights in another unit."""
@@ -432,7 +435,7 @@ class _Direct:
         position_m = poses.position_m if position_m is None else position_m
         at = self.directions(place_m, position_m, poses.rotation if rotation is None else rotation)
         (tower_array,) = link.tower_arrays.values()
-        level_db = free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0]
+        level_db = free_space_dbm(place_m[:, None], position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0]
         for end, array in (("uav", link.uav_array), ("tower", tower_array))[: 1 + tower]:
             theta, phi = np.radians(90.0 - at[f"{end}_elevation_deg"]), np.radians(at[f"{end}_azimuth_deg"])
             level_db = level_db + mean_gain_db(array.patterns, theta, phi)

@@ -349,13 +349,16 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
     inverse = np.linalg.inv(cover)
     ridge = np.exp(exact.x) * np.eye(design.shape[1])
     left = residual - design @ np.linalg.solve(design.T @ inverse @ design + ridge, design.T @ inverse @ residual)
-    fit = noise.fit_under_noise(residual, design, known, search=False)
+    designs = [noise.Columns(part) for part in (design[:, :1], design[:, 1:]) if part.size]
+    fit = noise.fit_under_noise(residual, designs, known, search=False)
     assert fit.log_likelihood == pytest.approx(
         known.log_prior - exact.fun + 0.5 * n * np.log(2.0 * np.pi), abs=tolerance
     )
     np.testing.assert_allclose(fit.residual_db, left, atol=max(0.2 * tolerance, 1e-3))
-    best = noise.fit_under_noise(residual, design, known, search=True)
-    assert best.log_likelihood >= max(noise.fit_under_noise(residual, design, near, search=False).log_likelihood
+    several = noise.log_likelihoods(np.column_stack([residual[::-1], residual]), designs, known)
+    assert several[1] == fit.log_likelihood
+    best = noise.fit_under_noise(residual, designs, known, search=True)
+    assert best.log_likelihood >= max(noise.fit_under_noise(residual, designs, near, search=False).log_likelihood
                                       for near in best.parameters.near)  # fmt: skip
 
 
@@ -364,7 +367,8 @@ def test_the_correlation_time_of_an_absent_part_of_the_noise_changes_no_digit(sh
     """Otherwise rounding errors decide where the search for the likeliest noise goes on."""
     residual = np.cumsum(np.random.default_rng(4).normal(size=200))
     every = [noise.NoiseParameters(*np.roll([at, 2], axis).tolist(), share) for at in range(5)]
-    fits = [noise.fit_under_noise(residual, np.full((200, 1), 100.0), each, search=False) for each in every]
+    offset = noise.Columns(np.full((200, 1), 100.0))
+    fits = [noise.fit_under_noise(residual, [offset], each, search=False) for each in every]
     assert len({fit.log_likelihood for fit in fits}) == 1
 
 
@@ -378,7 +382,9 @@ def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> N
         generator.normal(size=300),
         np.column_stack([np.full(300, 100.0), generator.normal(size=(300, 20))]),
     )
-    free, bound = (noise.fit_under_noise(residual, x, noise.START, search=True) for x in (design, design[:, :1]))
+    free, bound = (
+        noise.fit_under_noise(residual, [noise.Columns(x)], noise.START, search=True) for x in (design, design[:, :1])
+    )
     assert bound.log_likelihood - free.log_likelihood > 20.0
     value = np.linspace(-5.0, 5.0, 1001)
     peak = -0.5 * (value / 0.4) ** 2  # as wide as 0.4 times the root of 2 pi
@@ -392,7 +398,7 @@ def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> N
 def test_shifts_are_those_of_least_squares_on_whitened_samples_with_an_offset(phi: float) -> None:
     residual = np.cumsum(np.random.default_rng(4).normal(size=80)) + 3.0
     masks = np.array([np.arange(80) >= 30, np.arange(80) % 7 / 7.0, np.zeros(80)])
-    shift, error, gain = noise.shift_in_masks(residual, masks, phi)
+    _, (shift, error, gain) = noise.shifts_in_masks(residual, masks, (0.5, phi))
     y = residual[1:] - phi * residual[:-1]
     for k, mask in enumerate(masks[:2]):
         design = np.column_stack([np.ones(79), mask[1:] - phi * mask[:-1]])

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import shapely
 
 from ..common.errors import InputError, UsageError, parsing
 from ..common.files import opened
@@ -212,6 +213,8 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
         targets = replace(local, remarks=(*local.remarks, *_buried(local, site)))
     else:
         targets = _route(where, site, options)
+    if targets.grid is None:
+        targets = replace(targets, remarks=(*targets.remarks, *_in_buildings(targets, site)))
     if targets.grid is None and options.spacing_m is not None:
         raise UsageError("--spacing along a route", expected="a site: the spacing is that of a grid")
     if options.heading_deg is not None:
@@ -328,6 +331,16 @@ def _buried(points: Targets, site: Site) -> list[str]:
     return [f"{count} of {counted(len(up), 'point')} below the ground, where no path arrives."] if count else []
 
 
+def _in_buildings(points: Targets, site: Site) -> list[str]:
+    """Return a remark about points that are inside buildings."""
+    east, north, up = points.position_m[points.known].T
+    tree = shapely.STRtree([building.footprint for building in site.buildings])
+    point, index = tree.query(shapely.points(east, north), predicate="within")
+    ends = np.array([(b.base_m, b.base_m + b.height_m) for b in site.buildings]).reshape(-1, 2)
+    count = len(set(point[(ends[index, 0] < up[point]) & (up[point] < ends[index, 1])].tolist()))
+    return [f"{count} of {counted(len(up), 'point')} inside buildings, where no path arrives."] if count else []
+
+
 def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
     table = read_route(where, height_m=options.heights_m[0])
     place = table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy()
@@ -361,7 +374,8 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
         leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(position) - 1)
         position = interpolated(at, along, position)
         yaw, time = yaw[leg], at / SPEED_MPS
-        remarks += (f"The points are {STEP_M:g} m apart, and the times assume a speed of {SPEED_MPS:g} m/s.",)
+        if count > 1:
+            remarks += (f"The points are {STEP_M:g} m apart, and the times assume a speed of {SPEED_MPS:g} m/s.",)
     up = _leaning(position, time)
     return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, up=up, remarks=remarks)
 

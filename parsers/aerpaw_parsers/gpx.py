@@ -63,7 +63,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lines, known = split(data), _points(data)
     points = [(at, cells) for at, cells in known if {*_NAMES.values()} <= set(cells)]
     if known and not points:
-        raise InputError("a GPX track without times", expected="<time> in its points", cause="a route or a drawn track")
+        raise InputError("a GPX track without times", expected="<time> in its points", cause="a route: save it as KML")
     row = lines.number_at(at for at, _ in points)
     readings = [(int(i), cells) for i, (_, cells) in zip(row, points, strict=True)]
     sheet = _sheet.of_readings(lines, readings, _torn(lines, data, row))

@@ -64,6 +64,20 @@ def test_points_and_heights_below_the_ground(place: Path, capsys: pytest.Capture
         assert "'--height': expected greater than or equal to 0.1" in capsys.readouterr().err
 
 
+def test_a_route_through_a_building_is_reported(place: Path) -> None:
+    """A point in the air above the building is not inside it, and a route of one point has no spacing."""
+    (place / "points.csv").write_text("latitude_deg,longitude_deg,height_m\n48.0009,11,5\n48.0009,11.0009,5\n")
+    assert not any("inside buildings" in text for text in predicted(place)[1]["warnings"])
+    site = SITE + "buildings: [{name: b, height_m: 9, polygon_m: [[20, 90], [40, 90], [40, 110], [20, 110]]}]\n"
+    (place / "site.yaml").write_text(site)
+    table, metrics = predicted(place)
+    lost = int(table["level_db"].isna().sum())
+    assert lost == 2  # 20 m of the route, one point every 10 m
+    assert f"{lost} of {len(table)} points inside buildings, where no path arrives." in metrics["warnings"]
+    (place / "points.csv").write_text("latitude_deg,longitude_deg,height_m\n48.0009,11.0004,12\n")
+    assert not any("inside" in text or "apart" in text for text in predicted(place)[1]["warnings"])
+
+
 def test_options_replace_carrier_and_power_of_the_site(place: Path) -> None:
     level = predicted(place)[0]["level_db"].to_numpy()
     changed = predicted(place, "--tx-power-dbm", "20", "--carrier-ghz", "2.5")[0]["level_db"].to_numpy()

@@ -140,12 +140,11 @@ class Meaning:
 
 _WORDS = {word: english for english, words in _FILE["translations"].items() for word in words}
 # Latin and Cyrillic words are complete, Chinese, Japanese and Korean words have no spaces between them.
-_TRANSLATED = re.compile(
-    "|".join(
-        rf"(?<![^\W\d_]){word}(?![^\W\d_])" if word < "\u2e80" else word
-        for word in (*sorted(_WORDS, key=len, reverse=True), "[\u3040-\u9fff\uac00-\ud7af]+")
-    )
+_COMPLETE, _WITHIN = (
+    "|".join(word for word in sorted(_WORDS, key=len, reverse=True) if (word < "\u2e80") is complete)
+    for complete in (True, False)
 )
+_TRANSLATED = re.compile(rf"(?<![^\W\d_])(?:{_COMPLETE})(?![^\W\d_])|{_WITHIN}|[\u3040-\u9fff\uac00-\ud7af]+")
 # Headers copied from web pages contain zero-width spaces. Translated words may have underscores between them.
 _LETTERS = str.maketrans({"\u200b": "", "_": " ", "\u00b5": "u", "\u03bc": "u"})
 

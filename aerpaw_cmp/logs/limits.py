@@ -440,8 +440,9 @@ class _Check:
 
     def _all_silent(self) -> None:
         """Report a series without any level, because another unit can put all levels below the floor of the reader."""
-        silent = int(self.frame["flag"].str.contains("out_of_coverage").sum())
-        if silent and silent == len(self.frame) and not np.isfinite(self._values("rss_db")).any():
+        heard = np.isfinite(self._values("rss_db")).any()
+        silent = 0 if heard else int(self.frame["flag"].str.contains("out_of_coverage").sum())
+        if silent and silent == len(self.frame):
             levels = "the only level is" if silent == 1 else f"all {silent} levels are"
             self._said.append(f"{self._what}: {levels} below the floor of the reader (no signal, or another unit?)")
 
@@ -449,7 +450,7 @@ class _Check:
         """Flag a few placeholders far from all other levels, which programs write for lost readings."""
         level = self._values("rss_db")
         # -92 at the end of a file may have become -9, -127 may have become -12
-        most = np.where(self.frame["flag"] == UNTERMINATED, _CUT_DB, _LOST_DB)
+        most = np.where(self.frame["flag"].to_numpy() == UNTERMINATED, _CUT_DB, _LOST_DB)
         # -1 is also a common placeholder
         for lost, sign, word in ((np.abs(level) <= most, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):
             known = np.isfinite(level).sum()
@@ -474,7 +475,7 @@ class _Check:
         # the level returns within the next records; after fading it would not return so exactly
         turns = step > _APART_DB and min(back) < _BACK_SHARE * step
         # in most series few times repeat, and grouping them is slow
-        if not turns and 3 * len(np.unique(time)) > 2 * len(time):
+        if not turns and 3 * np.count_nonzero(np.diff(np.sort(time, kind="stable"))) > 2 * len(time):
             return
         at_once = pd.Series(level).groupby(time).agg(["min", "max", "size"])
         apart_db = (at_once["max"] - at_once["min"])[at_once["size"] > 1]

@@ -237,4 +237,4 @@ def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:
     text = values.body.decode(encoding, errors="replace")
     if len(text) != math.prod(shape):
         raise _damaged(f"{len(text)} characters for {shape[0]} rows of {shape[1]}")
-    return _texts(np.array(list(text), dtype="<U1").reshape(shape, order="F").tolist())
+    return _texts([text[row :: shape[0]] for row in range(shape[0])])  # MATLAB stores columns one after the other

@@ -70,12 +70,11 @@ class Lines:
     def blank(self) -> BoolArray:
         """The mask of lines that contain only white space."""
         empty = self.ends <= self.starts
-        # only lines that begin with white space can be blank, so that few lines are tested one by one
-        first = self.buffer[np.minimum(self.starts, max(len(self.data) - 1, 0))] if len(self) else np.empty(0, np.uint8)
-        for i in np.flatnonzero(
-            ~empty & ((first == 32) | (first == 9) | (first == 13) | (first == 11) | (first == 12))
-        ):
-            empty[i] = not self.data[self.starts[i] : self.ends[i]].strip()
+        # few lines begin and end with white space, and only those are tested one by one
+        some = np.flatnonzero(~empty)
+        ends = self.buffer[[self.starts[some], self.ends[some] - 1]]
+        for i in some[np.isin(ends, [*b" \t\r\v\f"]).all(axis=0)].tolist():
+            empty[i] = not self.raw(i).strip()
         return empty
 
     def raw(self, i: int) -> bytes:

@@ -83,8 +83,8 @@ def parts(
 
 def mostly_empty(sheet: _sheet.Sheet, column: int, where: BoolArray) -> str:
     """Return a sentence about a column of identities that is empty in most rows of a mask, but not in all."""
-    texts = np.array(_named(sheet, column))[where]
-    empty = int((texts == "").sum())
+    texts = [text for text, picked in zip(_named(sheet, column), where.tolist(), strict=True) if picked]
+    empty = texts.count("")
     if not _MOSTLY * len(texts) < empty < len(texts):
         return ""
     text = f"is empty in {counted(empty, 'row')}, which become a separate series"
@@ -288,7 +288,9 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     meaning = sheet.meanings[column]
     code = meaning is not None and meaning.quantity.name == "network" and sheet.plain[column].startswith(_CODES)
     none = {*_sheet.NO_VALUE, *_NO_IDENTITY, *("0" if code else "")}
-    texts = [_FLOAT.sub(r"\1", text) for text in sheet.texts(column)]
+    written = sheet.texts(column)
+    whole = {text: _FLOAT.sub(r"\1", text) for text in {*written}}
+    texts = [whole[text] for text in written]
     # 'lw1', 'LW1' and 'LW-1' are one tower, '3510 MHz' and '3.51 GHz' one carrier
     plain = {text: re.sub(r"(?<=[^\W\d])[-_ ](?=\d)", "", text.casefold()) for text in {*texts}}
     carriers = {text: attributes_of({sheet.plain[column]: text}).get("frequency_hz") for text in plain}

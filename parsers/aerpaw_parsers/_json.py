@@ -133,7 +133,7 @@ def beginning(head: bytes) -> list[dict[str, Any]]:
 
 def first(head: bytes) -> dict[str, Any] | None:
     """Return the first object of a file for sniffers, or None if it is longer than the sniffed bytes."""
-    begin = _ON_A_LINE.search(head)
+    begin = _ON_A_LINE.search(head) if b"{" in head else None
     if begin is None:
         return None
     try:

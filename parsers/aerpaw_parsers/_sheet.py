@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import compress, islice
 from typing import NamedTuple
 
@@ -56,6 +56,10 @@ def split_row(line: bytes, separator: str) -> list[str]:
     return fields if len(fields) > 1 else text.strip('"').split(separator)
 
 
+# Sniffers split the same lines several times.
+_fields = lru_cache(maxsize=4 * TITLES)(split_row)
+
+
 def header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, list[str]] | None:
     """Return the index, separator and names of the first line that is a header."""
     for i, line in enumerate(lines[:TITLES]):
@@ -65,8 +69,8 @@ def header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, l
         for separator in SEPARATORS:
             if separator.encode() not in line or (separator.startswith(" ") and not _is_even(lines[i:], separator)):
                 continue
-            names = [name.strip() for name in split_row(line, separator)]
-            below = [name.strip() for name in split_row(lines[i + 1], separator)] if i + 1 < len(lines) else []
+            names = [name.strip() for name in _fields(line, separator)]
+            below = [name.strip() for name in _fields(lines[i + 1], separator)] if i + 1 < len(lines) else []
             filled = [name or group for group, name in zip(names, below, strict=False)]
             # if merged cells, such as tower names, are above the names, their empty cells are filled with the names
             # below, and names that they repeat belong to several towers
@@ -82,7 +86,7 @@ def _is_even(lines: Sequence[bytes], separator: str) -> bool:
     """Check whether most lines below a header of columns between spaces have as many fields as the header."""
     if b": " in lines[0]:  # keys and values, such as those of YAML
         return False
-    width, *below = [len(split_row(line, separator)) for line in lines[:6] if line.strip()] or [0]
+    width, *below = [len(_fields(line, separator)) for line in lines[:6] if line.strip()] or [0]
     # R and pandas write no name above the numbers of rows
     return 2 * max(below.count(width), below.count(width + 1)) > len(below) and max(below) <= width + 1
 
@@ -247,7 +251,7 @@ class Sheet:
 
     def _names_rats(self, column: int) -> bool:
         """Check whether the cells of a column name radio accesses, such as those of a column ``mode``."""
-        cells = {cells[column].strip() for cells in self.cells[:200]} - {""}
+        cells = {cells[column] for cells in self.cells[:200]} - {""}
         return bool(cells) and all(map(_RAT.fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
@@ -287,7 +291,7 @@ class Sheet:
         found = {}
         for i, name in enumerate(self._own):
             of_what = re.fullmatch(r"(?:(.*) )?units?", name)
-            texts = {cells[i].strip().lower() for cells in self.cells} if of_what else set()
+            texts = {cells[i].lower() for cells in self.cells} if of_what else set()
             if of_what and len(texts) == 1 and dictionary.is_unit(text := texts.pop()):
                 self.used.add(i)
                 found["rss" if dictionary.unit_of(text) in _OF_LEVELS else of_what[1] or ""] = text
@@ -304,7 +308,7 @@ class Sheet:
         column = self.find("latitude_deg")
         if column is None:
             return False
-        values = np.array([_number(cells[column].strip())[0] for cells in self.cells[:200]])
+        values = np.array([_number(cells[column])[0] for cells in self.cells[:200]])
         values = values[np.isfinite(values)]
         return bool(len(values) and (np.abs(values) > 1e5).mean() > 0.5 and (values == np.round(values)).all())
 
@@ -331,7 +335,7 @@ class Sheet:
 
     def texts(self, column: int) -> list[str]:
         """Return a column as text."""
-        return [cells[column].strip() for cells in self.cells]
+        return [cells[column] for cells in self.cells]
 
     def numbers(self, column: int) -> FloatArray:
         """Return a column as read-only numbers in the unit of the dictionary, NaN for missing values.
@@ -355,15 +359,15 @@ class Sheet:
 
     def _parsed(self, column: int, texts: list[str]) -> FloatArray:
         meaning = self.meanings[column]
-        if self._has_points and all(_THOUSANDS.fullmatch(text) for text in texts if "," in text):
-            texts = [text.replace(",", "") for text in texts]
-        elif meaning is not None and meaning.quantity.role == "cell" and self.has_decimal_commas:
-            texts = [text.replace(".", "") for text in texts]  # an EARFCN of 2.300 is 2300
-        reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
-        if meaning is not None and meaning.quantity.name == "fix":
-            texts = [_fix(text) for text in texts]
         counts = Counter(texts)  # parse each distinct text once, because tables repeat texts
-        parsed = {text: reads(text) for text in counts}
+        left_out = ""
+        if self._has_points and all(_THOUSANDS.fullmatch(text) for text in counts if "," in text):
+            left_out = ","
+        elif meaning is not None and meaning.quantity.role == "cell" and self.has_decimal_commas:
+            left_out = "."  # an EARFCN of 2.300 is 2300
+        reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
+        in_words = meaning is not None and meaning.quantity.name == "fix"
+        parsed = {text: reads(_fix(text) if in_words else text.replace(left_out, "")) for text in counts}
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
         told = {text: count for text, count in counts.items() if text.lower() not in NO_VALUE}
         words = {text: count for text, count in told.items() if math.isnan(parsed[text][0])}
@@ -407,7 +411,7 @@ class Sheet:
             # some programs write both the letter and the sign
             return -np.abs(values) if own[1] == negative else values
         for i, name in enumerate(self.names):
-            letters = {cells[i].strip().upper() for cells in self.cells[:50]} - {""}
+            letters = {cells[i].upper() for cells in self.cells[:50]} - {""}
             if letters and letters <= {positive, negative} and (i == column + 1 or _OF_SIDES.search(name)):
                 self.used.add(i)
                 west = np.array([text.upper() == negative for text in self.texts(i)])
@@ -418,14 +422,14 @@ class Sheet:
     def _has_points(self) -> bool:
         """Check whether the first row has a decimal point, and commas only between thousands."""
         # test only the first row, because all rows have the same form
-        first = [cell.strip() for cell in self.cells[0]] if self.cells else []
+        first = self.cells[0] if self.cells else []
         commas = [cell for cell in first if _DECIMAL_COMMA.fullmatch(cell)]
         return any(_DECIMAL_POINT.fullmatch(cell) for cell in first) and all(map(_THOUSANDS.fullmatch, commas))
 
     @cached_property
     def has_decimal_commas(self) -> bool:
         """Check whether the first row has numbers with a decimal comma."""
-        return bool(self.cells) and any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in self.cells[0])
+        return bool(self.cells) and any(map(_DECIMAL_COMMA.fullmatch, self.cells[0]))
 
     def remarks(self) -> list[str]:
         """Return sentences about columns that are not read as they are written, or not read at all."""
@@ -607,7 +611,8 @@ def of_readings(
     row = np.array([i for i, _ in readings], dtype=np.int64)
     known = [*row, *(line.number - 1 for line in rejected)]
     return Sheet(
-        lines=lines, names=names, row=row, cells=[[cells.get(name, "") for name in names] for _, cells in readings],
+        lines=lines, names=names, row=row,
+        cells=[[cells.get(name, "").strip() for name in names] for _, cells in readings],
         blank_rows=np.setdiff1d(np.flatnonzero(~lines.blank), known), rejected=rejected, closed=True,
     )  # fmt: skip
 
@@ -646,7 +651,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
         if units or (not any(_VALUE.match(text) for text in words) and header.is_header(words)):
             comments.append(i)  # units below the names, or the header of a file that was appended
             continue
-        rows.append(_Row(i, len(fields), len(header.place), header.placed(fields)))
+        rows.append(_Row(i, len(fields), len(header.place), header.placed(words)))
         begun |= len(fields) == len(header.place)
     kept = _whole_rows(rows, header.names, numbers[-1] if numbers else at)
     if separator.startswith(" "):  # an empty cell shifts the cells after it
@@ -764,7 +769,7 @@ class _Header:
             return fields
         cells = [""] * len(self.names)
         for j, text, unit in zip(self.place, fields, self._unit, strict=False):
-            cells[j] = f"{text.strip()} {unit}" if unit and text.strip() else text
+            cells[j] = f"{text} {unit}" if unit and text else text
         return cells
 
 
@@ -785,7 +790,7 @@ def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
     for text, meaning in zip(cells, meanings, strict=False):
         if meaning is None:
             continue
-        value = _number(text.strip())[0]
+        value = _number(text)[0]
         if meaning.quantity.name in place and meaning.unit == "":
             place[meaning.quantity.name] |= np.isfinite(value)
         if dictionary.impossible(meaning.quantity, np.array([value]))[0]:
@@ -976,7 +981,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and day != column and not _stamps.is_dated(next(filter(None, texts), "")):
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
-    half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if _AM_PM.fullmatch(cell.strip())]
+    half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if _AM_PM.fullmatch(cell)]
     if half:
         sheet.used.add(half[0])
         texts = [" ".join(pair) for pair in zip(texts, sheet.texts(half[0]), strict=True)]

@@ -37,12 +37,6 @@ def sniff(head: bytes) -> bool:
     return kml.is_kml(head) and _HINT.search(head) is not None and b"(lat, lon) = (" in head
 
 
-def _reason(line: bytes) -> str | None:
-    if _HINT.search(line):
-        return "a Nemo description without time, quantity, position or altitude (truncated line?)"
-    return None  # markup
-
-
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Return rank, level or KPI streams, one per quantity in the file, and the track of the phone.
 
@@ -52,13 +46,16 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If ``time_origin`` is not a time, or is local and no time zone is given.
     """
     lines = _text.split(data)
+    described = lines.number_at(hint.start() for hint in _HINT.finditer(data))
+    torn = "a Nemo description without time, quantity, position or altitude (truncated line?)"
+    others = OtherLines(lambda _: torn, comments=np.setdiff1d(np.arange(len(lines)), described))
     reports = list(_RECORD.finditer(data))
     row = lines.number_at(item.start() for item in reports)
     names = ("time", "what", "value", "unit", *_POSITION)
     column = dict(zip(names, _text.columns([item.groups(b"") for item in reports], 7), strict=True))
     in_seconds = _in_seconds(*(_text.numbers(column[name]) for name in ("time", *_POSITION[:2])))
     rows = built(
-        lines, row, column, options, reader="nemo_kml", others=OtherLines(_reason),
+        lines, row, column, options, reader="nemo_kml", others=others,
         clock="relative_s" if in_seconds else "relative_ms",
     )  # fmt: skip
     if in_seconds:

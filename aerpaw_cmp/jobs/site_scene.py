@@ -174,6 +174,8 @@ def _towers(towers: Sequence[str], frame: SiteFrame, low: Any, high: Any) -> dic
     for text in towers:
         name, place = name_and_value(text, "--tower", "BS=10,20,25")
         east, north, up = numbers_of(place, (3,), f"--tower {name}", "--tower name=east,north,height")
+        if name in by_name:
+            raise UsageError(f"--tower '{text}'", expected="another name", cause=f"two towers named '{name}'")
         latitude, longitude = frame.to_geographic(east, north)
         by_name[name] = {
             "latitude_deg": round(float(latitude), 10),

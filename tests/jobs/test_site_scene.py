@@ -73,6 +73,8 @@ def test_what_a_scene_does_not_say_is_asked_for(room: Path, tmp_path: Path) -> N
         run_scene_import(room, out, SceneOptions(origin="-118.7,35.7"))
     with pytest.raises(UsageError, match="--tower A"):
         run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2"]))
+    with pytest.raises(UsageError, match="two towers named 'A'"):
+        run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3", "A=4,5,6"]))
     assert not out.exists()
     messages = run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3"]))
     assert any("no georeference" in line for line in messages)

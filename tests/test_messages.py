@@ -123,6 +123,13 @@ def test_a_wrong_port_of_the_tap_sends_to_the_doctor() -> None:
     assert "ri_hz is 1e+09; expected a positive number below 1e6" in said("tap log --ri-hz 1e9 --duration 1")[1]
 
 
+def test_a_name_that_the_simulator_cannot_use_names_the_option() -> None:
+    """It has no option -o."""
+    for line in ("modem-sim --link notes.txt", "modem-sim --flight flight.yaml --telemetry notes.txt"):
+        option = line.split()[-2]
+        assert said(line)[1].endswith(f"Next: the same command with another name after {option}")
+
+
 def test_every_message_stands_in_the_page() -> None:
     """The page lists the first commands that are tried, kind by kind."""
     listed = re.findall(r"^\| `(.*?)` \| \d", PAGE.read_text(encoding="utf-8"), re.MULTILINE)

@@ -352,6 +352,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "run that line, or use the engine 'image'"
     if isinstance(error, CheckError):
         return "read the page, or run without the check"
+    if option := re.search(r"a new name after (--\w+)", error.expected or ""):
+        return f"the same command with another name after {option[1]}"
     if isinstance(error, OutputError) or re.search(r"after -o\b|-o NAME|a new name", error.expected or ""):
         return "the same command with another name after -o"
     if place is not None and (reader := re.search(r"'(aerpaw-cmp [a-z]+) FILE' reads", error.found)):

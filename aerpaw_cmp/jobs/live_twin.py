@@ -148,7 +148,7 @@ class FlownAgain:
         try:
             self._file = telemetry.open("xb", buffering=0)
         except FileExistsError:
-            raise UsageError("the file exists", expected="a new name", path=telemetry) from None
+            raise UsageError("the file exists", expected="a new name after --telemetry", path=telemetry) from None
 
     def _levels(self, twin: LiveTwin) -> FloatArray:
         """Return the RSRP at each line of the telemetry: the replay, an offset, and fading."""

@@ -157,8 +157,8 @@ class ModemSimulator:
                 os.close(master)
                 raise UsageError(
                     "the name is taken",
-                    expected="a new name",
-                    cause="a simulator that was killed: remove it",
+                    expected="a new name after --link",
+                    cause="a simulator that was killed: remove its link" if link.is_symlink() else "a file of yours",
                     path=link,
                 ) from None
         return node

@@ -190,10 +190,12 @@ def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
         instant = (EPOCH + np.timedelta64(round(step.at_s), "s")).astype("datetime64[s]")
         sizes = ", ".join(f"{Printed(size):+.1f} dB at {name}" for name, size in step.sizes_db.items())
         return Cause(
-            name="gain step", channels=tuple(step.sizes_db), estimate=max(step.sizes_db.values(), key=abs),
+            name="gain step",
+            channels=tuple(step.sizes_db),
+            estimate=max(step.sizes_db.values(), key=abs),
             sentence=f"Likely cause: the level steps at {str(instant)[-8:]} UTC ({sizes}), unlike held-out flights.",
             next_step=_CHECK_GAIN,
-        )  # fmt: skip
+        )
     if cause is not None:
         return None if cause.name == "gain step" and len(known) == len(tables) else cause
     # a cable or a gain changes the offset alone
@@ -201,10 +203,12 @@ def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
     if healthy and len(known) == len(tables) and (off := level_of(channels)) is not None:
         side = "higher" if off.difference_db > 0 else "lower"
         return Cause(
-            name="level", channels=(off.name,), estimate=off.difference_db,
+            name="level",
+            channels=(off.name,),
+            estimate=off.difference_db,
             next_step="check its cable, attenuator and gain",
             sentence=f"The level at {off.where} is {abs(off.difference_db):.0f} dB {side} than on held-out flights.",
-        )  # fmt: skip
+        )
     return None
 
 
@@ -543,11 +547,10 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the tested lag of the radio clock, or the likeliest lag as an alternative without a name."""
     if e.clock is not None and e.clock.shifted:
         lag = e.clock.radio_minus_telemetry_s
-        late = np.interp(e.time_s - lag, e.time_s, e.predicted_db)
-        yield Trial(
-            name="clock", sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
-            change_db=late - e.predicted_db, estimate=(lag, *e.clock.ci95_s),
-        )  # fmt: skip
+        change_db = np.interp(e.time_s - lag, e.time_s, e.predicted_db) - e.predicted_db
+        sentence, step = f"the radio clock is {e.clock.in_words}", "`rss: {lag: apply}`"
+        estimate = lag, *e.clock.ci95_s
+        yield Trial(name="clock", sentence=sentence, next_step=step, change_db=change_db, estimate=estimate)
     yield from _drifting(e)
     # also try levels of another time or in reverse order, so that they are not attributed to other causes
     since, length = e.time_s - e.time_s[0], max(float(np.ptp(e.time_s)), 1e-9)
@@ -592,8 +595,7 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
 
 
 # Relative rates of a clock, least and largest error that they lead to [s], and where in the flight the clock is right.
-_RATES = tuple(sign * rate for rate in (0.0025, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05)
-               for sign in (-1.0, 1.0))  # fmt: skip
+_RATES = np.outer([0.0025, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05], [-1, 1]).ravel().tolist()
 _LEAST_DRIFT_S, _MOST_DRIFT_S, _RIGHT_AT = 3.0, 60.0, (0.0, 0.25, 0.5)
 
 
@@ -692,11 +694,11 @@ def _heading(e: LevelEvidence) -> Iterator[Trial]:
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
     """Yield an attitude that the settings do not use, or should not use."""
     for mode, change in e.attitude_db.items():
-        idle = mode != "ignored"  # ignoring a logged attitude is the less likely remedy
-        yield Trial(
-            name="attitude", cost=0.0 if idle else _RARE, change_db=change, next_step=f"`rt: {{attitude: {mode}}}`",
-            sentence="the UAV's attitude is not used" if idle else "the logged attitude does not fit the level",
-        )  # fmt: skip
+        cost, sentence = 0.0, "the UAV's attitude is not used"
+        if mode == "ignored":  # ignoring a logged attitude is the less likely remedy
+            cost, sentence = _RARE, "the logged attitude does not fit the level"
+        step = f"`rt: {{attitude: {mode}}}`"
+        yield Trial(name="attitude", cost=cost, change_db=change, sentence=sentence, next_step=step)
 
 
 def _height(e: LevelEvidence) -> Iterator[Trial]:
@@ -736,11 +738,10 @@ def _misread(e: LevelEvidence) -> Iterator[Trial]:
     """Yield telemetry with other units, signs or columns than its reader assumes."""
     # no factor corrects heights that jump
     jumps = (np.abs(np.diff(e.place_m[:, 2])) > _JUMP_M + _FASTEST_MPS * np.diff(e.time_s)).any()
+    step = "check the telemetry's columns and units"
     for meaning, change in {**e.misread_db, **({} if jumps else e.scaled_db)}.items():
-        yield Trial(
-            name="telemetry", cost=math.log(len(e.misread_db) + len(e.scaled_db)), sentence=meaning,
-            next_step="check the telemetry's columns and units", change_db=change,
-        )  # fmt: skip
+        cost = math.log(len(e.misread_db) + len(e.scaled_db))
+        yield Trial(name="telemetry", cost=cost, sentence=meaning, next_step=step, change_db=change)
 
 
 # A UAV climbs with at most 6 m/s, which are 20 m/s if feet are read as metres.
@@ -750,10 +751,9 @@ _JUMP_M, _FASTEST_MPS = 5.0, 25.0
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the log of another tower."""
     for name, level in e.other_towers_db.items():
-        yield Trial(
-            name="tower", cost=math.log(len(e.other_towers_db)), sentence=f"the log is that of {name}",
-            next_step=f"`node: {name}` in this `logs:` line", change_db=level - e.predicted_db,
-        )  # fmt: skip
+        sentence, step = f"the log is that of {name}", f"`node: {name}` in this `logs:` line"
+        change_db, cost = level - e.predicted_db, math.log(len(e.other_towers_db))
+        yield Trial(name="tower", cost=cost, sentence=sentence, next_step=step, change_db=change_db)
 
 
 def _place(e: LevelEvidence) -> Iterator[Trial]:
@@ -796,10 +796,9 @@ def _channels(e: LevelEvidence) -> Iterator[Trial]:
         return
     change_db = np.interp(e.time_s, _seconds(e.others[0], e), e.others[0].predicted_db) - e.predicted_db
     if change_db.std() > SHOWN_DB:
-        yield Trial(
-            name="channels", sentence="the channels of the tower are swapped", change_db=change_db,
-            next_step="check the cables, or swap the channels in the flight file",
-        )  # fmt: skip
+        step = "check the cables, or swap the channels in the flight file"
+        sentence = "the channels of the tower are swapped"
+        yield Trial(name="channels", sentence=sentence, next_step=step, change_db=change_db)
 
 
 def _seconds(other: LevelEvidence, e: LevelEvidence) -> FloatArray:
@@ -843,10 +842,8 @@ _RARE = 3.0
 def _cell(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a level that changes with the serving cell."""
     if e.serving is not None and np.ptp(e.serving) > 0.5:
-        yield Trial(
-            name="cell", sentence="the level steps where the phone changes its cell",
-            next_step="compare the cells separately", columns=_STEP_DB * e.serving[:, None],
-        )  # fmt: skip
+        sentence, step = "the level steps where the phone changes its cell", "compare the cells separately"
+        yield Trial(name="cell", sentence=sentence, next_step=step, columns=_STEP_DB * e.serving[:, None])
 
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
@@ -877,11 +874,10 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
             )  # fmt: skip
             return
     for factor, words in ((0.5, "half"), (2.0, "twice"))[: 1 if alike else 2]:
-        trial = Trial(
-            name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
-            sentence=f"the levels change by {words} the predicted decibels",
-            next_step="check: 10 log10 of power, 20 log10 of amplitude",
-        )  # fmt: skip
+        sentence = f"the levels change by {words} the predicted decibels"
+        step = "check: 10 log10 of power, 20 log10 of amplitude"
+        change_db, cost = (factor - 1.0) * e.predicted_db, 2.0 * _RARE + math.log(2.0)
+        trial = Trial(name="decibels", cost=cost, change_db=change_db, sentence=sentence, next_step=step)
         if not _nearer(e, factor * e.predicted_db):
             continue
         fit = _fitted(e, trial)
@@ -960,20 +956,18 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
         # if the levels vary, they are noise: means over seconds vary less, so a margin above the median is enough
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
-        yield Trial(
-            name="no detection", clipped=e.least, estimate=(level, level, level),
-            sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: not detected",
-            next_step=f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in this `logs:` line",
-        )  # fmt: skip
+        sentence = f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: not detected"
+        step = f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in this `logs:` line"
+        estimate = level, level, level
+        yield Trial(name="no detection", clipped=e.least, estimate=estimate, sentence=sentence, next_step=step)
 
 
 def _limits(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a floor and a ceiling, or a constant level: an input without signal, or all levels beyond a limit."""
     if is_flat(e.measured_db, [e.predicted_db]):
-        yield Trial(
-            name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
-            sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} throughout",
-        )  # fmt: skip
+        sentence = f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} throughout"
+        step = "check the receiver's input and gain"
+        yield Trial(name="flat", cost=_RARE, sentence=sentence, next_step=step, change_db=-e.predicted_db)
         return
     # if the lowest level is frequent, it marks samples without a detected signal, not a limit
     if e.least is None and not e.limits_known:
@@ -1094,12 +1088,10 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
         at = int(np.argmax(np.where(shift < -_LEAST_LOSS_DB, gain, -np.inf)))
         (middle, width), loss, reach = around[at], -float(shift[at]), 1.96 * float(error[at])
         first = (middle - 0.5 * width) % 360.0
-        yield Trial(
-            name="blocked", cost=cost, columns=_LOSS_DB * finer[at][:, None],
-            estimate=(loss, loss - reach, loss + reach),
-            sentence=f"a loss of {loss:.0f} dB towards {first:.0f} to {(first + width) % 360:.0f} degrees",
-            next_step="add the obstacle to the site",
-        )  # fmt: skip
+        sentence = f"a loss of {loss:.0f} dB towards {first:.0f} to {(first + width) % 360:.0f} degrees"
+        columns, step = _LOSS_DB * finer[at][:, None], "add the obstacle to the site"
+        estimate = loss, loss - reach, loss + reach
+        yield Trial(name="blocked", cost=cost, columns=columns, estimate=estimate, sentence=sentence, next_step=step)
 
 
 def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatArray:

@@ -149,15 +149,13 @@ def log_likelihoods(residuals: FloatArray, designs: Sequence[Columns], at: Noise
     return np.array([likelihood for likelihood, _ in _fits(residuals, designs, at)])
 
 
-def _fits(
-    residuals: FloatArray, designs: Sequence[Columns], parameters: NoiseParameters
-) -> list[tuple[float, FloatArray]]:
+def _fits(residuals: FloatArray, designs: Sequence[Columns], at: NoiseParameters) -> list[tuple[float, FloatArray]]:
     """Return the log likelihood and the coefficients (k,) of each residual (n, m) with some designs."""
     from scipy.linalg.lapack import dsyevd
 
-    n, targets = len(residuals), _whitened(residuals, parameters)
-    constant = math.log(_whitening(parameters)[2]) + parameters.log_prior
-    design = [columns.white(parameters) for columns in designs]
+    n, targets = len(residuals), _whitened(residuals, at)
+    constant = math.log(_whitening(at)[2]) + at.log_prior
+    design = [columns.white(at) for columns in designs]
     fits = []
     for i in range(targets.shape[1]):
         white = np.column_stack([targets[:, i : i + 1], *design])

@@ -152,8 +152,13 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         return _by_health(None, tables)
     # a gain over directions comes last, because it can look like many faults
     either = min(named, key=lambda e: (CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
-    cause = _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
+    cause = _named(_likeliest_first(either, best, odds), named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
+
+
+def _likeliest_first(either: Set[str], best: Set[str], odds: Mapping[frozenset[str], float]) -> list[str]:
+    """Return the names of causes in an order that does not change from run to run, as that of a set does."""
+    return sorted(either, key=lambda name: (name not in best, -_lead({name}, odds)))
 
 
 def _channels_showing(either: Set[str], best: Set[str], tables: Sequence[_Models]) -> list[_Models]:

@@ -372,6 +372,17 @@ def test_the_correlation_time_of_an_absent_part_of_the_noise_changes_no_digit(sh
     assert len({fit.log_likelihood for fit in fits}) == 1
 
 
+@pytest.mark.parametrize("likelier", ["first", "second"])
+def test_of_two_names_the_likelier_one_of_the_best_explanation_is_first(likelier: str) -> None:
+    both, odds = (
+        frozenset({"first", "second"}),
+        {frozenset(): 0.0, frozenset({"first"}): 4.0, frozenset({"second"}): 4.0},
+    )
+    ordered = causes._likeliest_first(both, both, odds | {frozenset({likelier}): 5.0})
+    assert ordered[0] == likelier
+    assert causes._likeliest_first(both, both - {likelier}, odds | {frozenset({likelier}): 5.0}) == ordered[::-1]
+
+
 def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> None:
     """Twenty columns of noise lower the evidence.
 

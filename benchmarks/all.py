@@ -72,7 +72,6 @@ SMALLEST: dict[str, list[str]] = {
     "published": ["tasks", "--data", "sample_logs"],
     "real_ground": ["--only", "aadm", "--no-fit"],
     "predicted_triples": ["--triples", "1"],
-    "predict_scale": ["--points", "500", "--flights", "2"],
     "replay": ["--quick"],
     "report": ["--quick"],
     "scaling": ["--axes", "poses"],

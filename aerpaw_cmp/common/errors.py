@@ -394,6 +394,12 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return f"'{command} --help' lists the options"
     if place is None:
         return f"correct the options and run the same command ('{command} --help' describes them)"
+    return _step_for(place, error, command, arguments)
+
+
+def _step_for(place: Path, error: AerpawCmpError, command: str, arguments: Sequence[str]) -> str:
+    """Return the step for an error that is about a file or folder."""
+    words = command.split()[1:]
     if not isinstance(error, InputError) and (not _exists(place) or "--" in f"{error.expected} {error.cause}"):
         return f"'{command} --help' lists the options"
     if not _exists(place):

@@ -13,6 +13,12 @@ from ...jobs.options import RunOptions
 from ..app import DryRun, Flights, Force, LogsRoot, command, output
 from ..shown import answered, print_files, records, say, show, warn_all
 
+_HEIGHT = Option(
+    min=0.1, max=10_000.0,
+    help="Height [m] of a grid, of the tool's own routes, and of route points without a height; repeatable  "
+    "[default: 40]",
+)  # fmt: skip
+
 
 @command(
     "predict",
@@ -36,14 +42,7 @@ def predict(
     flights: Flights = None,
     site: Annotated[str | None, Option(help="Site of a route or of points, without --with.")] = None,
     out: Annotated[Path | None, output("Output folder  [default: reports/prediction-<WHERE>]")] = None,
-    height: Annotated[
-        list[float] | None,
-        Option(
-            min=0.1,
-            max=10_000.0,
-            help="Height of a grid [m], repeatable, and of route points without a height  [default: 40]",
-        ),
-    ] = None,
+    height: Annotated[list[float] | None, _HEIGHT] = None,
     spacing: Annotated[float | None, Option(min=1.0, help="Spacing of a grid [m]  [default: 30]")] = None,
     heading: Annotated[
         float | None,
@@ -116,14 +115,7 @@ def plan(
     routes: Annotated[list[Path] | None, _ROUTES] = None,
     minutes: Annotated[float, Option(min=1.0, max=240.0, help="Longest flight that the battery allows [min].")] = 15.0,
     speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
-    height: Annotated[
-        list[float] | None,
-        Option(
-            min=0.1,
-            max=10_000.0,
-            help="Height of the tool's own routes, and of the grid of a target site [m]; repeatable  [default: 40]",
-        ),
-    ] = None,
+    height: Annotated[list[float] | None, _HEIGHT] = None,
     tower_distance: Annotated[float, Option(min=0.0, help="Smallest distance to towers [m].")] = 30.0,
     out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
     logs_root: LogsRoot = None,

@@ -139,10 +139,10 @@ def test_a_bad_folder_is_told_before_the_computation(
         raise AssertionError("the computation began")
 
     for name in (
-        "flight.data.gather",
         "jobs.campaign.run",
         "jobs.coverage_map.make_maps",
         "report.site.plan",
+        "flight.data.gather",  # last: a module that is imported afterwards would keep this function for all later tests
     ):
         monkeypatch.setattr(f"aerpaw_cmp.{name}", never)
     command = commands[job]

@@ -717,11 +717,10 @@ def _height(e: LevelEvidence) -> Iterator[Trial]:
     yield _tuned(e, e.raised_db, Trial(name="height", next_step="check the telemetry's height datum"), words)
     changes = _growing(e)
     best, cost = _likeliest(e, e.predicted_db + changes)
-    yield Trial(
-        name="height", cost=_RARE + cost, change_db=changes[best],
-        sentence=f"the logged height drifts by about {-_DRIFTS_M[best]:+.0f} m until the end of the flight",
-        next_step="check the barometer, or log the height of the GNSS", estimate=(_DRIFTS_M[best], math.nan, math.nan),
-    )  # fmt: skip
+    sentence = f"the logged height drifts by about {-_DRIFTS_M[best]:+.0f} m until the end of the flight"
+    estimate, step = (_DRIFTS_M[best], math.nan, math.nan), "check the barometer, or log the height of the GNSS"
+    cost, change_db = _RARE + cost, changes[best]
+    yield Trial(name="height", cost=cost, change_db=change_db, estimate=estimate, sentence=sentence, next_step=step)
 
 
 # True minus logged height at the end of a flight [m].
@@ -783,11 +782,9 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     radius = float(np.exp(np.interp(at, np.arange(len(radii)), np.log(radii))))
     azimuth = (around * 360.0 / len(azimuths)) % 360.0
     side = _SIDES[round(azimuth / 45.0) % 8]
-    yield Trial(
-        name="place", cost=cost, change_db=changes[best], estimate=(radius, math.nan, math.nan),
-        sentence=f"the tower is about {radius:.0f} m {side} of its stated place, or the track has the opposite error",
-        next_step="check the coordinates of both",
-    )  # fmt: skip
+    sentence = f"the tower is about {radius:.0f} m {side} of its stated place, or the track has the opposite error"
+    estimate, step = (radius, math.nan, math.nan), "check the coordinates of both"
+    yield Trial(name="place", cost=cost, change_db=changes[best], estimate=estimate, sentence=sentence, next_step=step)
 
 
 # Places further away than this become unlikely [m], and steps between the computed places.

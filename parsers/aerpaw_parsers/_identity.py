@@ -169,8 +169,8 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
     """
     key = keys[0]
     marks = cell_columns(sheet) if key == "network" and ("PCI" in keys or sheet.find("PCI") is None) else []
-    columns = [*known, *marks, *(i for i, m in enumerate(sheet.meanings) if m is not None and m.quantity.name in _CELL)]
-    columns = list(dict.fromkeys(columns))
+    of_cells = (i for i, m in enumerate(sheet.meanings) if m is not None and m.quantity.name in _CELL)
+    columns = dict.fromkeys([*known, *marks, *of_cells])
     table = pd.DataFrame({"time": rows.time, "levels": _levels(sheet), **{str(i): sheet.texts(i) for i in columns}})
     place = sheet.find("latitude_deg")
     if key == "device":
@@ -304,22 +304,25 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
 _FLOAT = re.compile(r"^(\d+)\.0+$")
 
 
-def cell_names(sheet: _sheet.Sheet, base: Sequence[str], nr: bool) -> tuple[list[str], dict[str, dict[str, Attribute]]]:
-    """Return a name per row that distinguishes cells of one PCI and carrier, and the attributes of each name.
+def cell_names(
+    sheet: _sheet.Sheet, base: Sequence[str], about: dict[str, dict[str, Attribute]], *, nr: bool
+) -> list[str]:
+    """Return a name per row that distinguishes cells of one PCI and carrier.
 
     Parameters
     ----------
     sheet : Sheet
     base : sequence of str, length n
         PCI and carrier of each row.
+    about : dict
+        The attributes of each name are added to it.
     nr : bool
         Whether the names are those of NR cells.
     """
     texts = {i: _named(sheet, i) for i in cell_columns(sheet, nr=nr)}
     chosen = dividing_columns(texts, _with_level(sheet), base)
     sheet.used |= {i for i, values in _values(texts).items() if len(values) <= _MOST_PARTS}
-    about: dict[str, dict[str, Attribute]] = {}
-    return labels(sheet, chosen, about), about
+    return labels(sheet, chosen, about)
 
 
 def labels(sheet: _sheet.Sheet, columns: Sequence[int], about: dict[str, dict[str, Attribute]]) -> list[str]:

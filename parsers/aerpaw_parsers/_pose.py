@@ -73,13 +73,9 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
     elif sheet.find("altitude_m") is not None:
         rows.warnings.append("the column of heights contains no number: heights are unknown")
     values |= _attitude(rows, sheet)
-    for key in (*VELOCITIES, "battery_v"):
-        if (column := sheet.find(key)) is not None:
-            values[key] = sheet.numbers(column)
-    for key in ("fix", "satellites"):
-        if (column := sheet.find(key)) is not None:
-            count = sheet.numbers(column)
-            values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
+    values |= sheet.found(*VELOCITIES, "battery_v")
+    for key, count in sheet.found("fix", "satellites").items():
+        values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else written  # a row at 0, 0 is a reading without a fix
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
@@ -412,9 +408,8 @@ def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitud
 
 def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     """Return angles in degrees. Their unit is in the name, known from the program, or guessed from the values."""
-    columns = {key: column for key in ANGLES if (column := sheet.find(key)) is not None}
-    values = {key: sheet.numbers(column) for key, column in columns.items()}
-    named = any(sheet.unit(column) for column in columns.values())
+    values = sheet.found(*ANGLES)
+    named = any(sheet.unit(column) for column in map(sheet.find, values) if column is not None)
     if not named and are_radians(values):
         rows.warnings.append(
             "the unit of the angles is unknown: read as radians because of their values, which is a guess"

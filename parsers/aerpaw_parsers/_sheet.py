@@ -273,6 +273,10 @@ class Sheet:
         ]
         return min(known)[-1] if known else None
 
+    def found(self, *quantities: str) -> dict[str, FloatArray]:
+        """Return the numbers of the quantities that have a column."""
+        return {name: self.numbers(i) for name in quantities if (i := self.find(name)) is not None}
+
     def named(self, *names: str) -> int | None:
         """Return the first column whose plain name is one of ``names``, or None."""
         return next((self._own.index(name) for name in names if name in self._own), None)

@@ -41,10 +41,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         others=OtherLines(lambda line: "an incomplete cell (truncated line?)" if b"Found CELL" in line else None),
     )  # fmt: skip
     rows.warnings += warnings
-    cells = [groups[i] for i in rows.at.tolist()]
     readings = [
         _cells.Reading(i, "lte", pci=float(cell[4]), arfcn=float(cell[3]), rsrp_dbm=float(cell[5]))
-        for i, cell in enumerate(cells)
+        for i, cell in enumerate(groups[at] for at in rows.at.tolist())
     ]
     return rows.result(_cells.streams(rows, readings, source="cell search", quantity="PSS power"))
 

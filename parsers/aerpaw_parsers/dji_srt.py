@@ -44,8 +44,7 @@ def _reading(text: bytes) -> dict[str, str]:
         fraction = f".{milliseconds}{microseconds}" if milliseconds else ""
         cells["timestamp"] = f"{year}-{month}-{day} {clock}{fraction}"
     elif (start := _BEGIN.match(text)) is not None:
-        hours, minutes, seconds = map(int, start[1].split(b":"))
-        cells["elapsed time s"] = f"{hours * 3600 + minutes * 60 + seconds}.{start[2].decode()}"
+        cells["elapsed time"] = b".".join(start.groups()).decode()
     return cells
 
 

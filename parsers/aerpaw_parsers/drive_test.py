@@ -14,7 +14,7 @@ several towers, ``time,snr_lw1,snr_lw2,...``.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import compress
@@ -67,8 +67,7 @@ def _quantities(names: list[str]) -> set[str]:
 def _has_time(names: list[str]) -> bool:
     """Check whether a name is that of a time, a date, or GPS weeks."""
     known = _quantities(names)
-    of_parts = {"gps_week", "gps_seconds"} <= known or _sheet.has_date_in_parts(names)
-    return of_parts or not known.isdisjoint(("time", "date"))
+    return bool(known & {"time", "date"} or {"gps_week", "gps_seconds"} <= known or _sheet.has_date_in_parts(names))
 
 
 # Readers of specific tables that pass the same test. They know units that are not in the names.
@@ -191,8 +190,7 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
         homes = [home for key, home in levels.items() if key[1] == role and (not rat or key[0] in ("", rat))]
         # the PCI may belong to a single level such as 'rsrp1' or 'RSRP[0]'
         if "pci" in cell.columns and role == "serving" and not homes:
-            near = [home for home in levels.values() if not home.place.startswith("n")]
-            homes = [home for home in near if not rat or home.rat in ("", rat)]
+            homes = [home for home in levels.values() if home.place[0] != "n" and (not rat or home.rat in ("", rat))]
         if {*cell.columns} == {"arfcn"} and role == "serving" and not homes:
             homes = [home for home in levels.values() if not rat or home.rat in ("", rat)]
             for home in homes:  # the carrier of a scan belongs to all cells of the row
@@ -363,9 +361,9 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     serving = next((cell.columns for cell in cells if cell.place == "serving"), {})
     identities = [sheet.texts(serving[name]) for name in _IDENTITY if name in serving]
     base = ["\t".join(row) for row in zip(*identities, strict=True)] or [""] * len(sheet)
+    about: dict[str, dict[str, Attribute]] = {}
     # 'cell_id' next to 'nr_cell_id' is the identity of the LTE cell
-    more, known = zip(*(_identity.cell_names(sheet, base, nr) for nr in (False, True)), strict=True)
-    about = known[0] | known[1]
+    more = [_identity.cell_names(sheet, base, about, nr=nr) for nr in (False, True)]
     owned: dict[tuple[str, ...], list[_Cell]] = {}
     for cell in cells:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""
@@ -495,14 +493,12 @@ def _renamed(stream: Stream | None, suffix: str) -> Stream | None:
     return replace(stream, name=f"{stream.name}_{suffix}", attributes=about)
 
 
-def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
-    """Return columns of a serving cell with values in rows without its level, as in Nemo's rows of events."""
-    columns = []
+def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> Iterator[int]:
+    """Yield columns of a serving cell with values in rows without its level, as in Nemo's rows of events."""
     for cell in cells:
         if cell.serving:
             silent = np.isnan(sheet.numbers(cell.columns["rsrp_dbm"]))
-            columns += [i for i in cell.measured if np.isfinite(sheet.numbers(i)[silent]).any()]
-    return columns
+            yield from (i for i in cell.measured if np.isfinite(sheet.numbers(i)[silent]).any())
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
@@ -512,20 +508,18 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
     """
     if sheet.program is None or "level" not in sheet.program.words:
         return
-    texts = sheet.texts(column) if (column := sheet.find("technology")) is not None else []
     # levels of 0 dBm and more are steps of older phones
     if (rssi := sheet.named("lterssi")) is not None:
         sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
-    level, quality = sheet.named("level"), sheet.named("qual")
-    assert level is not None
-    assert quality is not None
-    for name, older in (("RSCP", r"(?i)3g|umts|hspa|wcdma"), ("RxLev", r"(?i)2g|gsm|gprs|edge")):
-        mine = [re.search(older, text) is not None and not _rat(text) for text in texts]
-        if any(mine):
-            sheet.add(name, [cells[level] if its else "" for cells, its in zip(sheet.cells, mine, strict=True)])
+    technology, levels = sheet.find("technology"), [i for i in map(sheet.named, ("level", "qual")) if i is not None]
+    texts = [] if technology is None else sheet.texts(technology)
     unlike = np.array([not _rat(text) for text in texts], dtype=bool)
+    for name, older in (("RSCP", r"(?i)3g|umts|hspa|wcdma"), ("RxLev", r"(?i)2g|gsm|gprs|edge")):
+        mine = [re.search(older, text) is not None and its for text, its in zip(texts, unlike, strict=True)]
+        if any(mine):
+            sheet.add(name, [cells[levels[0]] if its else "" for cells, its in zip(sheet.cells, mine, strict=True)])
     if unlike.any():
-        sheet.silence(unlike, [level, quality])
+        sheet.silence(unlike, levels)
 
 
 def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from aerpaw_cmp.readers import InputError, Lines, Reader, ReadOptions, ReadResult, RejectedLine, Stream, split
+from aerpaw_cmp.readers import InputError, IntArray, Lines, Reader, ReadOptions, ReadResult, RejectedLine, Stream, split
 
 from . import _pose, _sheet, drive_test
 
@@ -85,12 +85,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result(streams)
 
 
-def _torn(lines: Lines, data: bytes, row: object) -> list[RejectedLine]:
+def _torn(lines: Lines, data: bytes, row: IntArray) -> list[RejectedLine]:
     """Return the lines on which an incomplete point begins."""
     tracked = b"<trkpt" in data
     starts = (start.start() for start in _START.finditer(data) if b"trkpt" in start[0] or not tracked)
-    begun = np.unique(lines.number_at(starts))
-    return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (truncated?)")
+    return lines.reject_all(np.setdiff1d(lines.number_at(starts), row), "a point without position or time (truncated?)")
 
 
 READER = Reader(

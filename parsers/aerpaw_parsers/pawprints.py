@@ -100,8 +100,6 @@ def _nr(rows: Rows, entries: list[dict[str, Any]]) -> Stream | None:
     """Return the level of the NR leg, which the phone reports separately and without a PCI."""
     legs = [_json.inside(item, "nr_signal_strength") for item in entries]
     level = _json.column(legs, "ss_rsrp")
-    if not np.isfinite(level).any():
-        return None
     finite = np.isfinite(level)
     shown, flag = rows.level(level)
     values = {"rss_db": shown, "rsrq_db": _json.column(legs, "ss_rsrq"), "sinr_db": _json.column(legs, "ss_sinr")}

@@ -82,10 +82,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _rank(rows: Rows, name: str, values: list[tuple[str, dict[str, float]]]) -> Stream | None:
     where = np.array([title == name for title, _ in values], dtype=bool)
-    column = {key: np.array([value.get(key, np.nan) for _, value in values]) for key in ("ri", "cqi", "mcs")}
-    ri = column["ri"]
+    ri, cqi, mcs = (np.array([value.get(key, np.nan) for _, value in values]) for key in ("ri", "cqi", "mcs"))
     flag = rows.flag.copy()
-    content = {"rank": checked_ranks(ri, flag, none=ri == 0), "ri_raw": ri, "cqi": column["cqi"], "mcs": column["mcs"]}
+    content = {"rank": checked_ranks(ri, flag, none=ri == 0), "ri_raw": ri, "cqi": cqi, "mcs": mcs}
     return rows.stream("rank", name, content, where=where, flag=flag, channel=name, ri_base="one", source="CSI report")
 
 

@@ -12,32 +12,19 @@ import numpy as np
 
 from aerpaw_cmp.readers import InputError, Reader, ReadOptions, ReadResult, split
 
-from . import _pose, _stamps
+from . import _pose
 
 _HEADER = re.compile(rb"(?m)^%\s{0,8}(GPST|UTC|JST)[\s,]{1,40}((?:latitude|x-ecef|e-baseline)\([^)\n]{1,9}\))")
 _N = r"[\s,]+(-?\d{1,9}\.\d{1,12})"
 # Day or GPS week, clock or second of the week, latitude, longitude, height, quality, satellites.
 _CLOCK = r"[\s,]+(\d\d:\d\d:\d\d(?:\.\d{1,9})?|\d{1,6}\.?\d{0,9})"
 _ROW = re.compile(r"\s*(\d{4}(?:/\d\d/\d\d)?)" + _CLOCK + 3 * _N + r"[\s,]+(\d)[\s,]+(\d{1,3})\b.*")
-_SCALE_S = {b"GPST": _stamps.LEAP_S, b"UTC": 0, b"JST": 9 * 3600}
 _FIX = dict(zip("123456", "653438", strict=True))
 
 
 def sniff(head: bytes) -> bool:
     """Check whether a comment names the columns of a solution."""
     return head.startswith(b"%") and _HEADER.search(head) is not None
-
-
-def _time(day: str, clock: str, scale_s: int) -> str:
-    """Return the UTC of a date and a clock, or of a GPS week and its second. Empty for other input."""
-    try:
-        if "/" in day:
-            time = np.datetime64(f"{day.replace('/', '-')}T{clock}", "us")
-        else:
-            time = np.datetime64("1980-01-06", "us") + round((int(day) * 604_800 + float(clock)) * 1e6)
-    except ValueError:
-        return ""
-    return f"{time - np.timedelta64(scale_s, 's')}Z"
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -54,14 +41,16 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             f"an RTKLIB solution of {ascii(header[2])[2:-1]}", expected="latitude and longitude in degrees",
             cause="another out-solformat: solve again with 'llh' and out-degform 'deg'",
         )  # fmt: skip
-    scale_s = _SCALE_S[header[1]] if header is not None else 0
+    scale = header[1].decode() if header is not None else "UTC"
     above_sea = header is not None and b"geodetic" in data[: header.start()]  # the default is the ellipsoid
-    names = ("time", "latitude", "longitude", "altitude msl" if above_sea else "height hae", "fix", "satellites")
+    names = ("latitude", "longitude", "altitude msl" if above_sea else "height hae", "fix", "satellites")
     for i in np.flatnonzero(~lines.blank).tolist():
         found = _ROW.fullmatch(lines.text(i))
-        if found is not None and (time := _time(found[1], found[2], scale_s)):
-            cells = (time, *found.group(3, 4, 5), _FIX.get(found[6], ""), found[7])
-            readings.append((i, dict(zip(names, cells, strict=True))))
+        if found is not None:
+            times = {f"time ({scale})": f"{found[1]} {found[2]}"}
+            times = times if "/" in found[1] else {"gps week": found[1], "gps seconds": found[2]}
+            cells = (*found.group(3, 4, 5), _FIX.get(found[6], ""), found[7])
+            readings.append((i, times | dict(zip(names, cells, strict=True))))
         elif not lines.raw(i).startswith(b"%"):
             rejected.append(lines.reject(i, "not 'date time latitude longitude height Q ns' (truncated?)"))
     return _pose.of_readings(lines, readings, rejected, options, reader=READER.name)

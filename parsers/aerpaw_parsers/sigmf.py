@@ -164,8 +164,7 @@ def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tup
         columns = {name: _column(captures, field, *names) for name, names in _PLACE}
         if not texts or len(columns["latitude_deg"]) != len(texts) or len(columns["longitude_deg"]) != len(texts):
             continue
-        turns = (("roll_deg", "roll"), ("pitch_deg", "pitch"), ("yaw_deg", "yaw"))
-        columns |= {name: _column(captures, "core:rotation", key) for name, key in turns}
+        columns |= {name: _column(captures, "core:rotation", name.removesuffix("_deg")) for name in _pose.ANGLES}
         rows = _rows_of(texts, options)
         values: dict[str, AnyArray] = {k: column[rows.at] for k, column in columns.items() if len(column) == len(texts)}
         about: _pose.Height = {}

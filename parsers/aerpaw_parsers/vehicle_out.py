@@ -110,17 +110,16 @@ def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
     rows.mark(zero, "zero_attitude")
     motion = {f"{name}_deg": np.degrees(number[name]) for name in ("roll", "pitch", "yaw")}
     motion |= {f"velocity_{way}_mps": number[way] for way in ("north", "east", "down")}
-    warnings = []
     if zero.any():
         rows_of = counted(int(zero.sum()), "row has", "rows have")
         text = f"{rows_of} attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
         if zero.all():  # not a real attitude: level and due north in every row
             text += " zero_attitude and read as unknown, because no row has another attitude"
             motion = {name: np.full(len(rows), np.nan) for name in motion}
-        warnings.append(text)
+        rows.warnings.append(text)
     if no_fix.any():
-        warnings.append(f"{counted(int(no_fix.sum()), 'row')} without a position fix: position NaN, flagged no_fix")
-    rows.warnings = [*warnings, *rows.warnings]
+        lines = counted(int(no_fix.sum()), "row")
+        rows.warnings.append(f"{lines} without a position fix: position NaN, flagged no_fix")
     if len(rows) > 10 and (number["fix"] == 6).all() and (number["satellites"] == 10).all():
         rows.warnings.append("fix 6 with 10 satellites throughout: probably a run of the digital twin, not a flight")
     counts = {name: number[name].astype(np.int64) for name in ("fix", "satellites")} | {"battery_v": number["volt"]}

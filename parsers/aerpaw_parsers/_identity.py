@@ -341,8 +341,8 @@ def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:
     """Return the attributes of a part: its identities as written, and a frequency in Hz."""
     about: dict[str, Attribute] = {}
     for name, text in written.items():
-        value, unit = _SI.fullmatch(text), re.search(r"\b[kmg](?=hz$)", name)
-        if "freq" in name and value is not None and (value[2] or unit or float(value[1]) > 1e6):
+        value, unit = _SI.fullmatch(text.replace(",", ".")), re.search(r"\b[kmg](?=hz$)", name)
+        if value is not None and ("freq" in name or name[:2] == "f ") and (value[2] or unit or float(value[1]) > 1e6):
             si = value[2] or (unit[0] if unit else "")
             about["frequency_hz"] = float(value[1]) * {"k": 1e3, "m": 1e6, "g": 1e9, "": 1.0}[si.lower()]
         else:

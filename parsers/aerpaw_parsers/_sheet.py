@@ -160,6 +160,7 @@ _OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", 
 # The radio access of a cell as programs write it.
 _RAT = re.compile(r"(?i)(lte|nr|[2345]g|gsm|umts|wcdma|e-?utran?)([ _-]?(a|nr|nsa|sa|lte|fdd|tdd|e-?utran?))?")
 _ANY_RAT = re.compile(r"(?i)lte|nr|^\s*\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|neigh|serv|detect|^\s*$")
+_DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}|\d\d([-/.])\d\d\3\d\d")
 # Names of cells and satellites in columns that usually contain a state or a count.
 _A_CELL = re.compile(r"(?i)(?!\s*([01](\.0)?|[ps]?cell ?\d*)\s*$).*\d")
 _NETWORK = dictionary.meaning("gateway")
@@ -167,8 +168,8 @@ _NAMES_IN = {"serving": _A_CELL, "neighbouring": _A_CELL, "satellites": re.compi
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that need no conversion.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
-# Further texts in a line of units: a count, a ratio and the zone of times.
-_BESIDE_UNITS = ("#", "-", "1", "UTC", "GMT")
+# Further texts in a line of units: a count, a ratio, the zone of times, and the form of dates and times, 'yyyy-mm-dd'.
+_BESIDE_UNITS = re.compile(rf"#|-|1|UTC|GMT|{'|'.join(_HARMLESS)}|(?i:[ymdhs]+([-/.: ]+[ymdhsf]+)+)")
 
 
 @dataclass
@@ -244,15 +245,17 @@ class Sheet:
         # 'serving cell' may be a cell and not a state, 'satellite' a satellite and not their number
         for i, form in ((i, _NAMES_IN.get(what.quantity.name)) for i, what in enumerate(known) if what):
             known[i] = _NETWORK if form and any(form.match(row[i]) for row in self.cells[:200]) else known[i]
-        if rats == unlike:
-            of_rats = dictionary.meaning("technology")
-            known = [of_rats if what is None and self._names_rats(i) else what for i, what in enumerate(known)]
+        # names such as 'mode' and 'Giorno' do not show that the cells are radio accesses and dates
+        names = {what.quantity.name for what in known if what}
+        for name, form in (("technology", _RAT), ("date", _DATE)):
+            of_form = None if name in names else dictionary.meaning(name)
+            known = [of_form if what is None and self._all_are(form, i) else what for i, what in enumerate(known)]
         return dictionary.with_places(zip(self.plain, known, strict=True))
 
-    def _names_rats(self, column: int) -> bool:
-        """Check whether the cells of a column name radio accesses, such as those of a column ``mode``."""
+    def _all_are(self, form: re.Pattern[str], column: int) -> bool:
+        """Check whether the first cells of a column have a form, except empty cells."""
         cells = {cells[column] for cells in self.cells[:200]} - {""}
-        return bool(cells) and all(map(_RAT.fullmatch, cells))
+        return bool(cells) and all(map(form.fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
         """Return the column that fits one of the quantities best, an empty column only if there is no other.
@@ -495,8 +498,9 @@ class Sheet:
         numbers = np.unique([int(text) for text in texts])
         called = _CALLED.search(self.plain[column])
         like = called or (np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any() and self.find("PCI") is None)
-        levels = any((what := self.meanings[i]) and what.quantity.role == "rss" for i in self.used)
-        return bool(like and levels and len(numbers) <= min(_MOST_NUMBERS, len(self) / 3))
+        known = {what.quantity.role for i in self.used if (what := self.meanings[i])}
+        levels = like and ("rss" in known or {*map(self.unit_read, self.used)} & {*_OF_LEVELS[1:]})
+        return bool(levels and len(numbers) <= min(_MOST_NUMBERS, len(self) / 3))
 
 
 _CALLED = re.compile(r"id\b|\b(unit|cc|chain|scell|no|num(ber)?)\b")
@@ -656,7 +660,8 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
             comments.append(i)  # units below the names, or the header of a file that was appended
             continue
         rows.append(_Row(i, len(fields), len(header.place), header.placed(words)))
-        begun |= len(fields) == len(header.place)
+        # a line of descriptions may precede that of the units
+        begun |= len(fields) == len(header.place) and any(map(_VALUE.match, words))
     kept = _whole_rows(rows, header.names, numbers[-1] if numbers else at)
     if separator.startswith(" "):  # an empty cell shifts the cells after it
         kept = [row for row in kept if row.fields == row.width]
@@ -733,10 +738,13 @@ class _Header:
         self._bare, self._repeated = [dictionary.without_unit(name)[0] for name in names], False
 
     def adds_units(self, texts: list[str]) -> bool:
-        """Check whether the line below the names contains their units, and add the units to the names."""
+        """Check whether the line below the names contains units, perhaps with a datum, and add them to the names."""
         texts = [text.strip("[]()") for text in texts]
         filled = [text for text in texts if text]
-        units = sum(dictionary.is_unit(text) or text in (*_HARMLESS, *_BESIDE_UNITS) for text in filled)
+        units = sum(
+            any(map(dictionary.is_unit, (text, text.partition(" ")[0]))) or _BESIDE_UNITS.fullmatch(text) is not None
+            for text in filled
+        )
         if len(texts) != len(self.names) or len(filled) < 2 or 2 * units <= len(filled):
             return False
         self.names[:] = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, texts, strict=True)]
@@ -983,6 +991,8 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     # a mapped column may also be a time of day that needs the column of dates
     day = sheet.find("date") if not mapped or column == _time_column(sheet) else None
     if day is not None and day != column and not _stamps.is_dated(next(filter(None, texts), "")):
+        if dictionary.meaning(sheet.names[day]) is None:
+            sheet.notes[day] = f"column {sheet.names[day]!r} is read as the dates of the times, a guess from its cells"
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
     half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if _AM_PM.fullmatch(cell)]

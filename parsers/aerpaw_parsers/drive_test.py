@@ -383,6 +383,7 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         )
     ]  # fmt: skip
     _name_others(rows, sheet, cells, others)
+    rows.warnings += () if rows.options.unit else _assumed_units(sheet)
     ranks = [i for i in ranks if not _numbers_cells(rows, sheet, i)]
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]
@@ -482,6 +483,23 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
         if repeated:
             shown = " and ".join(map(repr, [level, *repeated]))
             rows.warnings.append(f"{shown} are separate series: nothing in the table says whose levels they are")
+
+
+def _assumed_units(sheet: _sheet.Sheet) -> Iterator[str]:
+    """Yield a sentence about each level without a unit that may have another unit than the one assumed."""
+    for i, what in enumerate(sheet.meanings):
+        known = (
+            sheet.numbers(i)[np.isfinite(sheet.numbers(i))] if what and what.quantity.role == "rss" else np.array([])
+        )
+        if what is None or what.indirect or not len(known) or sheet.program or sheet.unit_read(i):
+            continue
+        if what.quantity.name == "power" or (what.quantity.name == "RSSI" and np.median(known) > _NEAR_FULL_SCALE):
+            text = f"no unit is written: read as {what.quantity.unit}, although levels are such as {known[0]:g}"
+            yield f"column {sheet.names[i]!r}: {text}. If this is wrong, use --unit"
+
+
+# The median RSSI of a receiver in the field is lower [dBm].
+_NEAR_FULL_SCALE = -25.0
 
 
 def _renamed(stream: Stream | None, suffix: str) -> Stream | None:

@@ -188,6 +188,7 @@ def test_an_autopilots_telemetry_radio_is_no_tower_beside_levels_of_the_experime
         ("when,battery_voltage,avg_power,power", "no column looks like rss_db"),
         ("timestamp,ref_lat,ref_lon,ref_alt,x,y,z", "positions on a grid"),
         ("time,freq_mhz,level_dbuv_m", "no column looks like rss_db"),
+        ("when,signal_percent,peak_power_dbfs", "no column looks like rss_db"),
         ("start_date,up time,rx power", "--map 'up time'=time --map 'rx power'=rss_db"),
         ("when_utc,y lat,x lon,strength", "--map 'when_utc'=time --map 'y lat'=latitude_deg"),
     ],

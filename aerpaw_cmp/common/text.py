@@ -2,7 +2,7 @@
 
 The commands and their one-line help are in this module, so that ``--help`` does not load anything else.
 
-The module also writes counts with their nouns.
+The module also writes counts with their nouns, and decodes lines of tables.
 
 Text cells of CSV files are guarded: names come from third-party logs, and a spreadsheet runs cells that begin with = +
 - or @.
@@ -62,6 +62,24 @@ _GUARDED = re.compile(r"(^|;)'")
 # In a comment a cell also begins after a separator. Numbers are not guarded, because some comments contain tables of
 # numbers.
 _IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
+
+
+# Bytes that no text in Latin-1 contains: control characters, three accented letters in a row, and UTF-8.
+_NOT_LATIN = re.compile(rb"[\x80-\x9f]|[\xa0-\xff]{3}|[\xc2-\xdf][\xa0-\xbf]")
+
+
+def decoded(line: bytes) -> str:
+    r"""Return a line as text in UTF-8, or in Latin-1 as programs of Western Europe write it.
+
+    Examples
+    --------
+    >>> decoded("H\u00f6he [m]".encode("latin-1")), decoded(b"\x93\xfa\x8e\x9e")
+    ('H\u00f6he [m]', '\ufffd\ufffd\ufffd\ufffd')
+    """
+    try:
+        return line.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return line.decode("utf-8-sig" if _NOT_LATIN.search(line) else "latin-1", errors="replace")
 
 
 def guarded(table: Any) -> Any:

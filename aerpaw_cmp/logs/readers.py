@@ -20,6 +20,7 @@ from functools import cache
 from typing import Literal
 
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line
+from ..common.text import decoded
 from .records import Attribute, Kind, ReadResult, Stream
 
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
@@ -279,7 +280,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 
 def _way_out(head: bytes) -> str:
     titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
-    lines = [line.decode("utf-8", "replace").strip() for line in titled.split(b"\n")[:20]]
+    lines = [decoded(line).strip() for line in titled.split(b"\n")[:20]]
     # the most frequent sign is the separator, because decimal commas are rarer; titles have fewer separators than names
     sign = max(",;\t|", key="".join(lines).count)
     first, *below = lines[max(range(len(lines)), key=lambda i: lines[i].count(sign)) :]

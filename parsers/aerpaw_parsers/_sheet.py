@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.text import decoded
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import NEAR_DEG
@@ -39,7 +40,7 @@ _IsHeader = Callable[[list[str]], bool]
 
 def split_row(line: bytes, separator: str) -> list[str]:
     """Split a line into fields, but not at separators inside quotes."""
-    text = line.decode("utf-8-sig", errors="replace")
+    text = decoded(line)
     if separator == "|" and text.startswith("|"):  # a table of Markdown
         text = text.strip("| ")
     if separator.startswith(" "):

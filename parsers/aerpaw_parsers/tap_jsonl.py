@@ -20,7 +20,7 @@ of a rank are those of the last ``servingcell`` within 2 s.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -184,10 +184,11 @@ def _frame(exchanges: list[_Record], query: str, leg: str, names: Mapping[str, s
 
 def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:
     """Yield the levels of each serving cell, whose identity is in the name if there are several."""
-    cells = rsrp.groupby(list(_IDENTITY), dropna=False, sort=False)
-    for key_of_cell, of_cell in cells:
-        values = cast("tuple[float, ...]", key_of_cell)
-        about = {key: int(value) for key, value in zip(_IDENTITY, values, strict=True) if np.isfinite(value)}
+    cells = rsrp.groupby(["pci", "arfcn"], dropna=False, sort=False)
+    for _, of_cell in cells:
+        # an answer that lost a line has no band, but belongs to the same cell
+        identity = of_cell[list(_IDENTITY)].max()
+        about = {key: int(identity[key]) for key in _IDENTITY if np.isfinite(identity[key])}
         words = [f"{key}{about[key]}" for key in ("pci", "arfcn") if key in about] if cells.ngroups > 1 else []
         name = "_".join(["nr5g_rsrp" if common["rat"] == "nr" else "lte_rsrp", *words])
         frame = of_cell.drop(columns=list(_IDENTITY)).reset_index(drop=True)

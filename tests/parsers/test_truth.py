@@ -153,6 +153,12 @@ BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
         + exchange(2, "10", "nr5g_csi", '{"rank":3,"ri_raw":3}').replace(b"1740927600", b"1740927602"),
         {"nr5g_rsrp": {"time": [0.002], "rss_db": [-70]}}, LOCAL,
     ),
+    "tap: an answer that lost its band is of the same cell": (
+        "tap_jsonl", "x.jsonl", samples.FILES["tap_jsonl/session"].splitlines(keepends=True)[0]
+        + exchange(1, "00", "servingcell", '{"nr":{"pcid":7,"arfcn":648000,"band":78,"rsrp_dbm":-70}}')
+        + exchange(2, "10", "servingcell", '{"nr":{"pcid":7,"arfcn":648000,"rsrp_dbm":-71}}'),
+        {"nr5g_rsrp": {"rss_db": [-70, -71]}}, LOCAL,
+    ),
 }  # fmt: skip
 CASES |= {name: Case(file, data, truth, reader, how) for name, (reader, file, data, truth, how) in BINARY.items()}
 SILENT = ["", "", "out_of_coverage", "", ""]

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import shapely
 
 from ..common.errors import InputError, UsageError, parsing
 from ..common.files import opened
@@ -36,7 +35,7 @@ from ..flight.track import interpolated, raised
 from ..logs.readers import HEAD_BYTES
 from ..maps.grid import Grid
 from ..propagation.field.baselines import free_space_dbm
-from ..propagation.geometry import Poses, rotation_from_aircraft, rotation_from_axes
+from ..propagation.geometry import Poses, inside_solids, rotation_from_aircraft, rotation_from_axes
 from ..site.site import Site
 from ..site.siteyaml import inputs_of_site
 from .calibrate import load_calibration
@@ -333,12 +332,9 @@ def _buried(points: Targets, site: Site) -> list[str]:
 
 def _in_buildings(points: Targets, site: Site) -> list[str]:
     """Return a remark about points that are inside buildings."""
-    east, north, up = points.position_m[points.known].T
-    tree = shapely.STRtree([building.footprint for building in site.buildings])
-    point, index = tree.query(shapely.points(east, north), predicate="within")
-    ends = np.array([(b.base_m, b.base_m + b.height_m) for b in site.buildings]).reshape(-1, 2)
-    count = len(set(point[(ends[index, 0] < up[point]) & (up[point] < ends[index, 1])].tolist()))
-    return [f"{count} of {counted(len(up), 'point')} inside buildings, where no path arrives."] if count else []
+    inside = inside_solids(site, points.position_m[points.known])
+    where = f"{inside.sum()} of {counted(len(inside), 'point')} inside buildings"
+    return [f"{where}, where no path arrives."] if inside.any() else []
 
 
 def _route(where: Path, site: Site, options: TargetOptions) -> Targets:

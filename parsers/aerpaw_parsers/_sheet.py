@@ -656,13 +656,14 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     header, rows, begun = _Header(_unique_names(names, group)), list[_Row](), False
     for i, fields in _without_empty_end(written, names):
         words = [text.strip() for text in fields]
+        valued = any(map(_VALUE.match, words))
         units = not begun and header.adds_units(words)
-        if units or (not any(_VALUE.match(text) for text in words) and header.is_header(words)):
+        if units or (not valued and header.is_header(words)):
             comments.append(i)  # units below the names, or the header of a file that was appended
             continue
         rows.append(_Row(i, len(fields), len(header.place), header.placed(words)))
         # a line of descriptions may precede that of the units
-        begun |= len(fields) == len(header.place) and any(map(_VALUE.match, words))
+        begun |= valued and len(fields) == len(header.place)
     kept = _whole_rows(rows, header.names, numbers[-1] if numbers else at)
     if separator.startswith(" "):  # an empty cell shifts the cells after it
         kept = [row for row in kept if row.fields == row.width]

@@ -488,12 +488,11 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
 def _assumed_units(sheet: _sheet.Sheet) -> Iterator[str]:
     """Yield a sentence about each level without a unit that may have another unit than the one assumed."""
     for i, what in enumerate(sheet.meanings):
-        known = (
-            sheet.numbers(i)[np.isfinite(sheet.numbers(i))] if what and what.quantity.role == "rss" else np.array([])
-        )
-        if what is None or what.indirect or not len(known) or sheet.program or sheet.unit_read(i):
+        if what is None or what.quantity.role != "rss" or what.indirect or sheet.program or sheet.unit_read(i):
             continue
-        if what.quantity.name == "power" or (what.quantity.name == "RSSI" and np.median(known) > _NEAR_FULL_SCALE):
+        known = sheet.numbers(i)[np.isfinite(sheet.numbers(i))]
+        near = what.quantity.name == "RSSI" and len(known) and np.median(known) > _NEAR_FULL_SCALE
+        if near or (len(known) and what.quantity.name == "power"):
             text = f"no unit is written: read as {what.quantity.unit}, although levels are such as {known[0]:g}"
             yield f"column {sheet.names[i]!r}: {text}. If this is wrong, use --unit"
 

@@ -29,6 +29,7 @@ from ..common.errors import UsageError
 from ..common.jsonable import number_key
 from ..common.units import AnyArray, FloatArray, IntArray, Printed, db_from_power, noise_floor_dbm, unmasked
 from ..compare.rank import rank_from_singular_values
+from ..site.site import NEAREST
 
 # Horizontal interval d_rx of the UAV positions.
 PAPER_SPACING_M = 30.0
@@ -205,7 +206,7 @@ def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, floa
 
 
 # Name of the joint map, in which the nearest tower serves each position.
-JOINT = "joint"
+JOINT = NEAREST
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

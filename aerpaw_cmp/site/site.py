@@ -18,6 +18,9 @@ from ..common.units import FloatArray
 from .mitsuba import TriangleScene
 from .relief import Dem
 
+# No tower has this name: it is that of the nearest tower in layers of maps, such as rank_k10_h030m_joint_opaque.
+NEAREST = "joint"
+
 
 @dataclass(frozen=True, slots=True)
 class Tower:

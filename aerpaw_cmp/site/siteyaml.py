@@ -38,13 +38,10 @@ from .materials import material
 from .mitsuba import TriangleScene
 from .relief import Dem, Surface, read_dem, surface_through
 from .scenes import placed_scene, without_traps
-from .site import Building, Forest, Geofence, Site, Tower, Trees
+from .site import NEAREST, Building, Forest, Geofence, Site, Tower, Trees
 
 # Packaged sites by name.
 PACKAGED = ("lake_wheeler",)
-
-# The name of the nearest tower in layers of maps, such as rank_k10_h030m_joint_opaque.
-_NEAREST = "joint"
 
 # A tower is refused if it is farther than this from both the origin and the area.
 _FAR_TOWER_M = 10_000.0
@@ -634,7 +631,7 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
 def _check_name(name: str, others: Iterable[str]) -> None:
     """Refuse a name that a map could not distinguish in its files from the nearest tower or from another tower."""
     in_files = re.sub(r"\W", "_", name)
-    if name == _NEAREST:
+    if name == NEAREST:
         raise UsageError(f"a tower named '{name}'", expected="another name", cause="maps call the nearest tower so")
     if twin := next((other for other in others if re.sub(r"\W", "_", other) == in_files), None):
         raise UsageError(

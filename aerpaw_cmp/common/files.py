@@ -139,7 +139,7 @@ def opened(path: Path, expected: str = "a file") -> BinaryIO:
 
 
 def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
-    """Return the content of a file or pipe of at most ``most`` bytes. A device could be endless.
+    """Return the content of a file of at most ``most`` bytes.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def main(arguments: list[str]) -> int:
     except Interrupted as interrupted:
         raise interrupted.error from None
     except typer.Abort as error:
-        if isinstance(error.__cause__, EOFError):  # from an unanswered question, which no command asks
+        if isinstance(error.__cause__, EOFError):  # the end of the input at a prompt, although no command has a prompt
             raise error.__cause__ from None
         raise KeyboardInterrupt from error
     except Exception as error:

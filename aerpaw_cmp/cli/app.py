@@ -136,7 +136,7 @@ def _with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
             print_plan(ended.plan)
             return 0
         except KeyboardInterrupt as error:
-            raise Interrupted(error) from None  # typer would turn it into a silent exit code
+            raise Interrupted(error) from None  # typer would turn a KeyboardInterrupt into a silent exit code
 
     # resolve annotations here, because typer would evaluate these texts in its own module
     hints = {name: _bare(hint) for name, hint in get_type_hints(function, include_extras=True).items()}

@@ -43,7 +43,7 @@ class ProgressLines:
             return
         if fraction is None:
             self.warn(text)
-        elif self._bar is not None or sys.stderr.isatty():  # while a bar is shown, rich 13.7 reports that there is none
+        elif self._bar is not None or sys.stderr.isatty():  # rich 13.7 hides the terminal while it shows a bar
             self._draw(text, fraction)
         else:
             name, _, tail = text.partition("\t")

@@ -52,7 +52,7 @@ def site_crs(frame: SiteFrame) -> Any:
 
 
 def file_attributes(title: str, source: str, comment: str) -> dict[str, str]:
-    """Return the attributes of a file: its content, its author program and its time.
+    """Return the global attributes of a file: conventions, title, source, history and references.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
 
 
 def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple[int, ...]:
-    """Return the shape of a chunk: 1 along a dimension that grows, at most a MiB along the first growing dimension."""
+    """Return the shape of a chunk of about 1 MiB or less. Only the first dimension that grows is longer than 1."""
     sizes = dict(zip(dims, values.shape, strict=True))
     fixed = math.prod(size for name, size in sizes.items() if name not in grows)
     step = max(1, min(sizes.get(grows[0], 1), (1 << 20) // max(values.dtype.itemsize * fixed, 1)))

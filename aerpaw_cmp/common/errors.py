@@ -12,7 +12,7 @@ class                   exit code  meaning
 A message contains what was found, what was expected, the likely cause and the place.
 Any other exception that reaches a user is a bug in this package.
 
-The last part of every message is the command or edit to try after a failure.
+Every message ends with the next step: the command to run or the line to edit.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def interrupted() -> bool:
 
 
 def last() -> signal.Signals:
-    """Return the signal of the latest interrupt, also after :func:`noted` has ended."""
+    """Return the signal of the latest interrupt, even after :func:`noted` has ended."""
     return signal.Signals(_last)
 
 

@@ -24,7 +24,7 @@ def number_key(number: float) -> str:
 
 
 def json_safe(value: Any) -> Any:
-    """Return a copy for JSON: NaN and infinity become None, arrays lists, keys text, and records mappings by field.
+    """Return a copy for JSON. NaN and infinity become None, arrays become lists, and records become mappings.
 
     A field of a record (dataclass) whose default is None is omitted if it is None, because the record does not have
     this value.

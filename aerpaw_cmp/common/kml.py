@@ -153,9 +153,9 @@ def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
 
 # --- writing -------------------------------------------------------------------------------------------------------
 
-# Colours of the classes: Z grey, then ranks 1 to 4 from dark to light (viridis), then spare colours.
+# Colours of the classes: grey for out of coverage, then ranks 1 to 4 from dark to light (viridis), then spare colours.
 CLASS_COLOURS = ("#9e9e9e", "#440154", "#31688e", "#35b779", "#fde725", "#e66101", "#b2182b")
-# Date of all entries, which is fixed so that the same content has the same bytes.
+# Date of all entries of an archive. It is fixed, so that the same content always produces the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -172,7 +172,7 @@ def coordinates(longitude: FloatArray, latitude: FloatArray, up_m: FloatArray | 
 
 
 def mark(name: str, at: str, *, in_the_air: bool = False) -> str:
-    """Return a named point. In the air it is on a pole at its height above the ground."""
+    """Return a named point. A point in the air is drawn at its height, with a line down to the ground."""
     height = "<extrude>1</extrude><altitudeMode>relativeToGround</altitudeMode>" if in_the_air else ""
     point = f"<Point>{height}<coordinates>{at}</coordinates></Point>"
     return f"<Placemark><name>{xml_text(name)}</name>{point}</Placemark>"
@@ -268,11 +268,11 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
 
 
 def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> bytes:
-    """Return a legend with colours by label as PNG, ``width`` inches wide."""
+    """Return a legend of labelled colours as a PNG image, ``width`` inches wide."""
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
-    # do not use a figure of matplotlib, which takes 0.1 s; keep the ground visible by partial transparency
+    # a matplotlib figure would take 0.1 s; the background is partly transparent, so that the map stays visible
     size = round(width * _DPI), round((0.38 + 0.155 * len(colours)) * _DPI)
     picture = Image.new("RGBA", size, (255, 255, 255, 230))
     pen = ImageDraw.Draw(picture)

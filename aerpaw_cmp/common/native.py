@@ -26,7 +26,8 @@ from .units import AnyArray
 # Limit for all arrays of a file together [bytes].
 MOST_BYTES = 1 << 30
 MOST_RATIO = 200
-# A file may always declare this many bytes, and ``MOST_RATIO`` times its size: text compresses to a hundredth.
+# Any file may declare this many bytes. A file may also declare up to ``MOST_RATIO`` times its own size, because text
+# compresses to a hundredth.
 FREE_BYTES = 1 << 26
 _MOST_ITEMS = 100_000
 _MOST_MEMORY = 4 << 30

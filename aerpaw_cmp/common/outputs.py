@@ -430,7 +430,7 @@ class OutputFolder:
             place.part.rename(self.target)
         _sync_folder(self.target.parent)
         if replaced:
-            with contextlib.suppress(OSError):  # the results are complete, and the next run tries again
+            with contextlib.suppress(OSError):  # the results are complete, and the next run clears the remains
                 _clear(place.part)
 
 
@@ -514,15 +514,15 @@ class _Place:
             )
 
     def _claim(self, folder: bool) -> int:
-        for _ in range(1000):  # another run may remove it between our steps
+        for _ in range(1000):  # another run may remove the hidden path between two of these steps
             try:
                 if folder:
                     with contextlib.suppress(FileExistsError):
                         self.part.mkdir()
                     descriptor = os.open(self.part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
                 else:
-                    # links are not followed, because another user could have put one into a shared folder; private
-                    # until finished
+                    # do not follow a link, which another user could have put into a shared folder; the file is private
+                    # until it is finished
                     descriptor = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             except FileNotFoundError:
                 if not self.part.parent.is_dir():

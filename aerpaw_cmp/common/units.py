@@ -32,7 +32,7 @@ MINIMUM_HEIGHT_M = 0.5
 # International foot [m] (exact).
 FOOT_M = 0.3048
 
-# Radio carriers [Hz] that a setting can mean: a smaller number is in MHz or GHz; a larger number was converted twice.
+# Range of carriers [Hz] that a setting accepts. A smaller number is in MHz or GHz; a larger one was converted twice.
 LOWEST_CARRIER_HZ, HIGHEST_CARRIER_HZ = 1e6, 1e12
 
 # Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact).

@@ -402,7 +402,7 @@ def _kind(keys: Iterable[str]) -> str | None:
 # Parts of a location that name the tried member of a union. No key of this package has such a name.
 _MEMBER = re.compile(r"literal\[.*\]|(constrained-)?float|int|str|bool")
 
-# What is expected, by pydantic's name of the error.
+# The expected value in words, by pydantic's name of the error.
 _KINDS = {
     "float_(type|parsing)": "a number",
     "int_(type|parsing|from_float)": "a whole number",
@@ -446,7 +446,7 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
 
 
 def _homes(model: type[pydantic.BaseModel], key: object, above: str = "") -> Iterator[str]:
-    """Yield the parts of a file, in words, that have a key of this name."""
+    """Yield a description of each part of a file that has a key of this name."""
     for name, info in model.model_fields.items():
         path, kind = f"{above}{name}", typing.get_origin(info.annotation)
         inner = {list: "a line of '{}:'", dict: "an entry of '{}:'"}.get(kind, "'{}:'") if kind else "'{}:'"

@@ -55,11 +55,11 @@ class Check:
 
 
 def checks() -> list[Check]:
-    """Return all checks, in the order in which a new user needs them, after some seconds for the test of LLVM."""
+    """Return all checks, in the order in which a new user needs them. The test of LLVM takes some seconds."""
     gpu = _gpu_check()
     # Dr.Jit is only installed with Sionna RT, and only Dr.Jit uses LLVM
     compilers = list(llvm_checks()) if versions.version("drjit") != versions.NOT_INSTALLED else []
-    if "tested" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
+    if "tested" in gpu.found and gpu.status == "ok":  # LLVM is not needed if a GPU works
         compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
     return [
         Check("Python", "ok", f"{platform.python_version()} ({sys.executable})"),
@@ -243,7 +243,7 @@ def serial_check(device: str, description: str = "") -> Check:
         remedy = f"sudo usermod -aG {group} $USER, then log in again"
         return Check("Serial", "warn", f"{port}: not allowed", remedy)
     if busy := [f"{holder.name} ({holder.pid})" for holder in holders(Path(device), others_only=False)]:
-        # it opens every port of a new modem automatically, and reads the answers to our commands
+        # ModemManager opens every port of a new modem automatically, and reads the answers to our commands
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"
         return Check("Serial", "warn", f"{port}: held by {', '.join(busy)}", stop)
     return Check("Serial", "ok", port)

@@ -79,7 +79,8 @@ class Recipe:
     model : GainModel
         Terms, and initial values of their strengths.
     patterns : mapping of str to callable
-        Gain of measured patterns in the device frame, for ``uav`` and antennas (``tower.channel``). It can be empty.
+        Gain of measured patterns in the device frame, for ``uav`` and antennas (``tower.channel``). The mapping can be
+        empty.
     """
 
     model: gains.GainModel
@@ -343,7 +344,9 @@ def flight_left_out(
 
 
 def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: float = 0.0) -> tuple[Score, ...]:
-    """Score the prediction of each campaign by the airframe of the other campaigns only. Empty for a single campaign.
+    """Score levels of each campaign, predicted with the UAV gain of other campaigns with the same airframe only.
+
+    Campaigns are omitted if no other campaign has their airframe.
 
     Parameters
     ----------
@@ -510,7 +513,7 @@ def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float
 
 
 def world_frame(observed: Sequence[Observed]) -> list[Observed]:
-    """Return the samples with the UAV's directions in world axes, as a control: no antenna is fixed in them."""
+    """Return the samples with the UAV's directions in world axes, as a control: no antenna is fixed in these axes."""
     return [_with_uav(o, -o.samples.at_tower) for o in observed]
 
 

@@ -47,9 +47,9 @@ from .statistics import is_flat
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
 # Largest number of words in the sentence and the next step of a cause, because the first paragraph has at most sixty.
 MOST_CAUSE_WORDS = 28
-# A cause must reduce the RMSE by this share. Half of it suffices if the log odds per channel reach the second number,
-# because a floor leaves the error of all levels above it. An unnamed cause with such odds shows that none of the
-# explanations is right.
+# A cause must reduce the RMSE by this share. Half of the share suffices if the log odds per channel reach the second
+# number: correcting a floor, for example, does not change the error of the levels above the floor. An unnamed cause
+# with such odds shows that none of the explanations is right.
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
 # The sentence states the RMSE without and with the cause. As printed, the two numbers must differ by this [dB].
 SHOWN_DB = 0.1
@@ -143,9 +143,9 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         rejected = certain - frozenset().union(*named)
         if not rejected:
             break
-        # in the second pass, a cause that may not be named takes no credit for a part of the error
+        # in the second pass, a cause that was rejected does not explain any part of the error
         beside = certain - rejected
-    # an almost certain cause that may not be named shows that no explanation fits
+    # if an almost certain cause was rejected, no explanation fits, so do not name a gain over directions
     if any(_lead({other}, odds) >= _CERTAIN for other in rejected):
         named = {either: shown for either, shown in named.items() if CATCH_ALL not in either}
     if not named:
@@ -175,7 +175,10 @@ def _channels_showing(either: Set[str], best: Set[str], tables: Sequence[_Models
 
 
 def _unpaid(models: Sequence[_Model]) -> float:
-    """Return the cost of common numbers that the channels without these numbers would share."""
+    """Return the part of the search's cost that falls on channels without the fault.
+
+    All channels of a tower share the cost of a search for numbers that they have in common.
+    """
     trials = [((model.evidence.tower, trial.name), trial) for model in models for trial in model.trials]
     users = Counter(cause for cause, _ in trials)
     return sum(max(trial.channels / users[cause] - 1.0, 0.0) * trial.cost for cause, trial in trials)
@@ -280,8 +283,8 @@ class _Conditions:
     learned_share : float
         The same with learned antennas, whose error is a few decibels on every flight.
     part : float
-        Smallest reduction of the error that remains after the other causes, as a share of that by all candidates. It
-        applies to flights without learned antennas.
+        Smallest reduction of the error that remains after the other causes, as a share of the reduction by all
+        candidates. It applies to flights without learned antennas.
     of_uav : bool
         True if the cause changes the levels of all channels.
     of_tower : bool
@@ -371,12 +374,13 @@ def _holds_in_halves(models: Sequence[_Model], most: float) -> bool:
     return bool(after <= most**2 * before)
 
 
-# Largest ratio of the error of the other half with and without the gain. The second one is for learned antennas and for
-# a gain that leaves at most the next share of the error, because halves of a short flight show few directions.
+# A gain is fitted to one half of the flight. Largest ratio of the RMSE of the other half with the gain to that without
+# it. The second ratio applies to learned antennas, and to a gain after which at most the next share of the RMSE
+# remains, because halves of a short flight show few directions.
 _MOST_IN_HALVES, _MOST_OF_ERROR = (0.75, 0.85), 0.5
-# Number of means per independent sample of the error. Halves may show different directions, so a pattern with the next
-# log odds per channel is not tested. Learned antennas leave an error of 3 dB and more, so a pattern is not the cause of
-# an error below the last number [dB].
+# Number of means per independent sample of the error. Halves may show different directions, so the test of halves is
+# skipped if the log odds per channel reach the second number. Learned antennas leave an error of 3 dB and more, so a
+# pattern is not the cause of an error below the last number [dB].
 _CORRELATED_BINS, _SURE_GAIN, _LEAST_DB = 10.0, 20.0, 2.5
 
 

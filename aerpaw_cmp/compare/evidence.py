@@ -159,7 +159,7 @@ def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
 
 
 def ages(time_s: AnyArray, level_db: FloatArray) -> FloatArray:
-    """Return for how long each level (n,) of a log was repeated before: the time since the last change."""
+    """Return the time since the last change of the level, for each sample (n,) of a log."""
     changed = np.diff(level_db, prepend=np.nan) != 0.0
     return np.asarray(time_s - np.maximum.accumulate(np.where(changed, time_s, -np.inf)))
 
@@ -172,7 +172,7 @@ def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
 
 
 def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
-    """Return a number per second, which is the same while the UAV neither moves nor turns."""
+    """Return a group number for each second. It stays the same while the UAV neither moves nor turns."""
     azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
     flat = np.cos(elevation)
     towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])

@@ -17,7 +17,7 @@ of the other flight from 3.53 to 4.00 dB.
 
 The error model of a level with learned antennas consists of gain, nuisance of the flight, noise and fading.
 
-The levels of a flight are evidence whether antennas learned on other flights apply to it. The levels must be more
+The levels of a flight show whether antennas learned on other flights apply to it. The levels must be more
 likely with the learned gain than with an unknown gain under the prior of a calibration. They must also be more likely
 than with the learned gain of the UAV rotated by 90, 180 or 270 deg. Offset, nuisance, noise and all other gains are the
 same in each case. Names of readers, files and channels have no effect.
@@ -580,7 +580,8 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
 # 2.0 and 2.2 for LTE, 2.0 and 3.0 for AADM. One pair for all campaigns is 18 to 99 nat less likely.
 _CAMPAIGN_SCALES_DB = tuple(product((0.8, 1.2, 2.0, 3.0), (1.0, 1.5, 2.2, 3.2)))
 
-# Number of these means that determines the scales of an antenna. A tower of AADM has 42, a port of dataset 12 has 310.
+# An antenna has its own scales if it has at least this number of means. A tower of AADM has 42, a port of dataset 12
+# has 310.
 _FEWEST_MEANS = 100
 
 

@@ -54,8 +54,8 @@ class RssComparison:
     n : int
         Number of compared pairs.
     n_out_of_coverage, n_measured_out, n_simulated_out : int
-        Numbers of samples with a known pose and no measured signal or no simulated path: either of them, no signal, and
-        no path.
+        Numbers of samples with a known pose that are out of coverage in the measurement or the simulation, in the
+        measurement (no signal), and in the simulation (no path).
     n_no_pose : int
         Samples without a pose, which are not compared.
     at_edge : bool

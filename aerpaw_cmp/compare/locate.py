@@ -147,9 +147,9 @@ _REACH_M, _SPACING_M = 400.0, 40.0
 # spacing. The likeliest positions are then divided until the spacing is reached.
 _MOST_GRID, _MOST_DIVIDED = 500, 500
 
-# The level of a node this far away hardly changes along a flight; levels that fit it as well as the best place do not
-# determine a place. Log odds of the best place: 4 to 76 on six real flights with a rover in reach, at most 0.3 for
-# constant levels and hovers.
+# The level of a node this far away hardly changes along a flight. Levels that fit such a node as well as the best place
+# do not determine a place. Log odds of the best place: 4 to 76 on six real flights with a rover in reach, at most 0.3
+# for constant levels and hovers.
 _AFAR_M, _PLACED_ODDS = 30_000.0, 0.5
 
 # Positions are ignored if their log evidence is lower than the maximum by more than this.

@@ -177,7 +177,7 @@ def total_variation(first: ArrayLike, second: ArrayLike) -> float:
 
 
 def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the Wasserstein-1 distance of two rank histograms: by how many ranks shares must move on average.
+    """Return the Wasserstein-1 distance of two rank histograms: the average number of ranks by which shares must move.
 
     Examples
     --------

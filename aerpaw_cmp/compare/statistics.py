@@ -10,8 +10,9 @@ sufficient coverage for all of them. Because the weights alone would make some i
 widened or narrowed, depending on the correlations that the sequence shows. Weights and widening factors were found by
 simulation (``benchmarks/interval_weights.py``).
 
-Statistics of ranks and of paired models are means of contributions of the samples, so they have the same intervals.
-Comparisons over all channels of a flight also learn the correlation from each channel (:class:`Channels`).
+Statistics of ranks and of paired models are means of contributions of the samples, so their intervals are computed in
+the same way. Comparisons over all channels of a flight also learn the correlation from each channel
+(:class:`Channels`).
 
 Passes over the same positions are compared for every pair of flights: 199 000 pairs for 200 flights with ten links. The
 positions of a flight are therefore put into one k-d tree, pairs whose boxes are apart are not searched, and
@@ -568,7 +569,7 @@ _BOUND = 2.0
 _SEGMENTS = 24
 
 # Nominal share of flights with a false verdict on any channel. A nominal 0.05 has 1 to 10 % in simulations, because
-# small chances are known less well than the ends of an interval.
+# small probabilities are estimated less accurately than the ends of an interval.
 _FAMILY = 0.02
 
 Interval = tuple[float, float]
@@ -709,8 +710,8 @@ def influence_interval(
     Notes
     -----
     This is the interval of the mean of ``influence``, with the weights of paired differences. On simulated ranks it
-    covers the truth as often as by the weights of offsets. At 1000 samples and 150 m it has 1.3 times the width for a
-    known correlation, instead of 1.8 times.
+    covers the true value as often as with the weights of offsets. At 1000 samples and 150 m it has 1.3 times the width
+    for a known correlation, instead of 1.8 times.
     """
     if len(influence) < FEWEST or not np.isfinite(estimate):
         return NO_INTERVAL
@@ -959,11 +960,13 @@ def pooled_difference(
 
 
 def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | None = None) -> list[PairedDifference]:
-    """Correct the verdicts of several channels for their number (Holm 1979): all that remain are true in 95 % of cases.
+    """Correct the verdicts of several channels for their number (Holm 1979).
+
+    With a probability of 95 %, all remaining verdicts are right.
 
     Channels with the same ``measured`` levels count once.
     """
-    # Holm: the smallest chance is multiplied by the number of channels, the next by one less
+    # Holm: multiply the smallest p-value by the number of channels, the next one by one less, and so on
     order = sorted(range(len(pairs)), key=lambda i: pairs[i].p_value)
     names = measured or range(len(pairs))
     out, tried = list(pairs), {names[i] for i in order if pairs[i].verdict != "no interval"}

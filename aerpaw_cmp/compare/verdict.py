@@ -267,7 +267,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
 
 
 def verdict_of(difference: MeanOfFlights) -> RankingVerdict:
-    """Return the verdict whether a setting is significantly worse than the first."""
+    """Return the verdict on whether a setting is significantly worse than the first one."""
     if not np.isfinite(difference.low):
         return "no interval"
     return "worse" if difference.low > 0 else "not significant"

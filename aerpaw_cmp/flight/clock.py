@@ -224,7 +224,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     or at the most likely lag of a model. For each lag, the model with the highest likelihood counts. A poor model
     therefore cannot exclude a lag. The best lag must be more likely than a level that does not depend on position at
     all. A shift must also be significant without any fifth of the flight, because one dip, jump of the position or
-    frozen track must not decide. A lag that repeated readings explain is no shift.
+    frozen track must not decide. A lag that repeated readings explain is not a shift.
     """
     alive = [channel for channel in channels if not channel.flat]  # a constant level contains no information about time
     named = [channel.along.predicted_db for channel in alive]
@@ -364,7 +364,7 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means (n,) of the levels of a channel, the times (s,) of the predictions, and the first of these of each mean.
+    """Means (n,) of a channel's levels, times (s,) of the predictions, and the index of the first time of each mean.
 
     ``features`` of directions are averaged over the same duration about each time. ``levels`` (g, models) are the
     predictions.
@@ -436,7 +436,7 @@ class _Bins:
             level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
             residual = self.mean_db[:, None] - level
             out[:, row, :features] = self._between(self.mean_s - lag, self.features)
-            # the offset is fitted anyway, and numbers near 0 keep their digits
+            # the offset is fitted in any case, and sums of numbers near 0 lose less precision
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 

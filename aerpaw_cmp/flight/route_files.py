@@ -307,7 +307,7 @@ _HEADING = re.compile(r"\s*(-?\d+(?:\.\d*)?)")
 
 
 def _root(data: bytes) -> ElementTree.Element:
-    """Return the document, whose bytes are UTF-8 with any declaration."""
+    """Return the root of a document in UTF-8. An encoding that the document declares is ignored."""
     return xml_root(re.sub(rb"\A\s*<\?xml.*?\?>", b"", data, flags=re.DOTALL), None, "a plain KML")
 
 

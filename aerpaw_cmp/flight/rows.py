@@ -103,7 +103,7 @@ def may_lose_lock(stream: Stream) -> bool:
 
 
 def is_sounder_power(stream: Stream) -> bool:
-    """Check whether a stream can be a level of the sounder, which may have a lock quality. Its name is any channel."""
+    """Check whether a stream can be a level of the sounder, which may have a lock quality. Any name is possible."""
     levels = stream.kind == "rss" and stream.attributes.get("quantity") is None
     return levels and stream.attributes.get("unit") == "dB re full scale"
 

@@ -382,7 +382,7 @@ class FlightSimulator:
 
     def _poses(self, time_s: FloatArray) -> Poses:
         position = self.trajectory.position_at(time_s)
-        # as in the replay, because direct and reflected ray cancel on the ground
+        # raise low positions, as the replay does: on the ground, the direct and the reflected ray cancel
         position[:, 2] = np.maximum(position[:, 2], MINIMUM_HEIGHT_M)
         if self.settings.rt.attitude == "ignored":
             return Poses(position, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)))

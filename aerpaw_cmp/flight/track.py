@@ -128,9 +128,9 @@ def height_in_name(path: str) -> float | None:
 # Longest telemetry gap that is interpolated [s]. Rows of vehicleOut are 1.0 s apart.
 _MAXIMUM_GAP_S = 3.0
 
-# Sparse telemetry is interpolated by straight lines. All intervals are, if nine of ten fixes are at most this far apart
-# [m] (28 m for 14 s at 2 m/s). On a faster flight, an interval is interpolated only if one of its ends is this close
-# [m] to the line between the neighbouring fixes. In the field data, nine of ten are within 7.7 m.
+# Sparse telemetry is interpolated by straight lines. If nine of ten steps between fixes are at most this long [m] (28 m
+# for 14 s at 2 m/s), all intervals are interpolated. On a faster flight, an interval is interpolated only if one of its
+# ends is this close [m] to the line between the neighbouring fixes. In the field data, nine of ten are within 7.7 m.
 _SPARSE_APART_M, _SPARSE_ERROR_M = 100.0, 10.0
 
 # In sparse telemetry, an interval longer than this multiple of the usual interval is a gap.
@@ -191,7 +191,7 @@ class TrackAccount:
         Used rows below the ground plane of the site.
     sparse_s : float
         Usual interval of sparse telemetry that is interpolated by straight lines [s]; 0 for other telemetry.
-    sparse_error_m : (median, ninth of ten)
+    sparse_error_m : (median, 90th percentile)
         Error of these lines: half the distance of each fix from the line between its neighbours [m].
     gaps : int
         Number of intervals between used rows that exceed the limit.

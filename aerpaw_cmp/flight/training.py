@@ -8,7 +8,7 @@ A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 - ``digits``: one digit every half second for the change of a level or a rank. It is the mean over 1 s minus the mean
   over 10 s, in steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
 - ``runs``: the smallest hashes of short runs of changes between readings, in steps of half a decibel (a bottom-k
-  sketch, Broder 1997), 8 hex digits each. Many remain after rounding to 0.1 dB. Another flight has other ones.
+  sketch, Broder 1997), 8 hex digits each. Many remain after rounding to 0.1 dB. Another flight has different hashes.
 
 Two fingerprints belong to one log if they share runs, or if their clocks agree and their digits correlate at some lag.
 The digits of a log correlate with those of a part of it, and with those of a thinned, resampled, rounded or scaled
@@ -59,9 +59,10 @@ _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 # Because of the strides, a copy with every second to fifth row has the same runs.
 _RUN, _LEAST_CHANGES, _STRIDES = 16, 8, (1, 2, 3, 4, 5)
 
-# Steps of a change [dB]. The second is for logs without changes of the size of the first. The first is no multiple of
-# 0.1, because changes at the boundary of two steps would depend on rounding errors. Rounding to 0.1 dB leaves a quarter
-# of the runs. Of ten simulated repeats of a flight whose levels differ by 0.2 dB at equal places, none shares two runs.
+# Steps of a change [dB]. The second is for logs without changes of the size of the first. The first is not a multiple
+# of 0.1, because changes at the boundary of two steps would depend on rounding errors. Rounding to 0.1 dB leaves a
+# quarter of the runs. Of ten simulated repeats of a flight whose levels differ by 0.2 dB at equal places, none shares
+# two runs.
 _CHANGES_DB = (0.51, 0.001)
 
 # A series with fewer different values has no runs, because ranks along one route change similarly on every flight.

@@ -100,7 +100,7 @@ def dry_run(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) -
 
 
 def _counts(place: FloatArray, known: BoolArray, value: FloatArray, lowest_m: float | None) -> tuple[int, int, int]:
-    """Return the numbers of samples with a value, also with a position, and also high enough."""
+    """Return the numbers of samples with a value, with a value and a position, and with both and enough height."""
     valued = np.isfinite(value)
     placed = valued & known
     high = placed if lowest_m is None else placed & (place[:, 2] >= lowest_m)
@@ -375,7 +375,7 @@ MINIMUM_HEIGHT_M = 5
 _FLOWN_ABOVE_M = 15.0
 
 
-# Links that the audit of a first report checks.
+# Number of links that the audit of a first report checks.
 _QUICK_AUDIT = 24
 
 _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
@@ -506,7 +506,7 @@ def _shaded(lines: Sequence[_Line], context: _Context) -> tuple[str, list[str]]:
     return keys, comments
 
 
-# Search this far around the offsets that free space needs.
+# Margin of the proposed search range around the median offsets from free space [dB].
 _MARGIN_DB = 20.0
 
 

@@ -60,7 +60,7 @@ from ..training import among, flight_logs, logs_of, marks_of, series_mark
 _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
 # Log odds that learned antennas must add. Thirds of LW1 flights have 8 to 57 with antennas from one or two flights.
-# 158 of 165 positions elsewhere have less than the 5 that a tower needs.
+# At 158 of 165 positions elsewhere, they add less than 5, so that the log odds stay below those of a tower.
 _LEARNED_MORE = 5.5
 
 # Log evidence by which the levels must fit another tower better than the one that a name specifies.
@@ -244,7 +244,7 @@ class NodeFinder:
                 learned_odds = max(self._learned_odds(track, tower.name, each) for each in fitting) - np.log(
                     len(fitting)
                 )
-                # odds against any position, as those of the search
+                # relative to any position, like all other odds
                 learned_odds -= estimate.anywhere + _LEARNED_MORE
                 known[i] = learned_odds if learned_odds >= _TOWER_ODDS else -np.inf
                 odds_tower[i] = max(odds_tower[i], learned_odds)
@@ -581,7 +581,7 @@ def propose(
     data : FlightData
         Without learned antennas.
     place : str or Path
-        The site, as :func:`.read_learned` takes it.
+        The site, as an argument of :func:`.read_learned`.
     site : str
         Its name in the names of the antennas.
     nodes : Nodes
@@ -795,8 +795,8 @@ def _airframe_for(
 
 
 # Prior log odds of antennas of both ends, with the same names of tower and channel or the same receiver, and those of a
-# receiver with levels in another unit. Levels of field flights add 13 and more, so they can outweigh equal names. Those
-# of a short or smooth flight cannot. The unit belongs to the receiver, so it says nothing about the antennas.
+# receiver with levels in another unit. Levels of field flights add 13 and more, so they can outweigh equal names.
+# Levels of a short or smooth flight cannot. The unit depends on the receiver and not on the antennas.
 _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 
 # Prior log odds that known antennas are mounted as before, and not rotated by a quarter turn or more.
@@ -957,7 +957,7 @@ def learned_towers(site: str | Path, log: tuple[str, str], *, loses_lock: bool) 
 def offered(data: FlightData) -> FlightFile | None:
     """Return the settings of a flight with the learned antennas that its levels support. None if no antenna fits."""
     site = data.settings.site.file
-    own = frozenset(data.settings.towers)  # placed by their own flight, as the rovers of other flights were
+    own = frozenset(data.settings.towers)  # like rovers of other flights, the flight file itself places these nodes
     nodes = Nodes(placed=own, fixed=[name for name in data.site.towers if name not in own])
     try:
         known = propose(data, data.site_place, str(Path(site).with_suffix("")), nodes, carrier_known=True)

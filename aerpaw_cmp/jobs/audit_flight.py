@@ -167,7 +167,7 @@ _MOMENTS = 6
 
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected, RtSettings]]:
-    """Yield replays with fixed towers, and their expected inputs and settings. A moving tower is fixed at times."""
+    """Yield replays, expected inputs and settings. A moving tower is replaced by fixed towers at some times."""
     of_each = _settings_of(data)[: len(replays)]
     for replayed, expected, rt in zip(replays, expectations(data, replays), of_each, strict=True):
         site = data.site.under(rt.foliage)

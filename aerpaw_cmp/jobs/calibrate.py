@@ -216,7 +216,7 @@ _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
 
 
 class CampaignSettings(StrictModel):
-    """The flights of one campaign, which have the same noise. Campaigns with the same airframe share the UAV's gain."""
+    """The flights of a campaign, with one error model. Campaigns with the same airframe share the gain of the UAV."""
 
     flights: Annotated[list[str], Field(min_length=1)]
     source: Source = Source()

@@ -273,7 +273,7 @@ def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatA
 
 
 def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
-    """Return the geometries to try: arrays upright, rolled by 90 deg (both equal after half a turn), and lying flat."""
+    """Return the geometries to try: upright, rolled by 90 deg, and lying flat. Half a turn repeats the first two."""
     half, full = (np.arange(0.0, end, grid.yaw_step_deg) for end in (180.0, 360.0))
     mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
     tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())

@@ -34,8 +34,8 @@ from .tasks import inputs_of_flight
 
 _MOST_POSES = 10_000_000
 
-# Size of gains and frequency responses per part, and largest size in memory [bytes]. Then two estimates: paths per
-# link, and bytes per path in addition to its gains.
+# Size of gains and frequency responses per part, and largest size in memory [bytes]. The other two numbers are
+# estimates: paths per link, and bytes per path in addition to its gains.
 _PART_BYTES, MOST_BYTES, _PATHS, _PATH_BYTES = 16 << 20, 2 << 30, 4, 512
 
 
@@ -196,7 +196,7 @@ def _chosen_link(settings: FlightFile, chosen: ChannelOptions) -> tuple[str, Lin
 
 
 def _chosen_towers(data: FlightData, chosen: ChannelOptions, remarks: list[str]) -> list[str]:
-    """Return the towers by name. A moving tower must be the only one, on its track: its scene changes."""
+    """Return the names of the towers. A moving tower is exported alone, along the track, because its scene changes."""
     if unknown := [name for name in chosen.towers if name not in data.site.towers]:
         raise UsageError(f"the site has no tower {unknown[0]!r}", expected="one of " + ", ".join(data.site.towers))
     logs = [str(log.node) for log in data.settings.logs if log.node in data.site.towers]

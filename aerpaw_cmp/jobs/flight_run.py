@@ -54,7 +54,7 @@ from .compare_flight import Levels, compare_flight, fitted_receiver, levels_of
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any real field.
 _WEAK_GROUND_DB = 10.0
 
-# Smaller gains are not visible on a page [dB].
+# Smaller reductions of the RMSE are not visible on a page [dB].
 _SHOWN_DB = 0.1
 
 # Largest number of samples per series. A longer series is thinned.
@@ -331,7 +331,7 @@ class _ModelSearch:
 
     @cached_property
     def _reliefs(self) -> dict[Relief, Site]:
-        """The site with the other grounds of its file, if the flight has flat ground and no separate node."""
+        """The site on each other ground of its file, if the flight has flat ground and no additional node."""
         data, flat = self._data, self._data.site
         if flat.dem or flat.scene or data.settings.towers or any(t.ground_m for t in flat.towers.values()):
             return {}

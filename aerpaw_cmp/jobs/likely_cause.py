@@ -77,7 +77,7 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     # prefer the test of the clock, which knows gains over directions, to a pattern; it does not know obstacles
     if late is not None and (cause is None or CATCH_ALL in cause.name.split(" or ")):
         return late, None
-    # without an antenna that the flight file names, errors by direction are expected, and a caution has the reason
+    # errors by direction are expected if a named antenna could not be used; a caution contains the reason
     if any(not c.used for c in data.settings.cautions) and by_direction:
         return None, "see the first caution: a learned antenna that the flight file names is not used"
     # learned antennas, of the flight file or of `report --with`, have an error of some decibels on each flight
@@ -142,7 +142,7 @@ _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site
 def is_simulated(telemetry: Stream) -> bool:
     """Check whether receiver and battery are those of ArduPilot's simulator, which AERPAW's emulator runs.
 
-    At least two of its signs (fix 6, 10 satellites, few voltages of the battery) are in the log, and none contradicts.
+    The log must contain at least two of its signs (fix 6, 10 satellites, few battery voltages), and contradict none.
     """
     rows = telemetry.frame
     if len(rows) < _FEWEST_ROWS:
@@ -150,7 +150,7 @@ def is_simulated(telemetry: Stream) -> bool:
     signs = [bool((rows[name] == value).all()) for name, value in _RECEIVER.items() if (rows[name] >= 0).any()]
     if "battery_v" in rows and len(rows) >= _FEWEST_VOLTAGES:
         volts = rows["battery_v"].dropna().to_numpy()
-        # voltages in steps of 0.1 V are few for any battery
+        # in steps of 0.1 V, any battery has few different voltages
         if len(volts) and (np.abs(volts * 10.0 - np.round(volts * 10.0)) > 1e-6).any():
             commonest = np.sort(np.unique(volts, return_counts=True)[1])[-3:]
             signs.append(bool(commonest.sum() >= _SHARE_OF_VOLTAGES * len(volts)))
@@ -158,8 +158,9 @@ def is_simulated(telemetry: Stream) -> bool:
 
 
 _RECEIVER = {"fix": 6, "satellites": 10}
-# Smallest numbers of rows for the tests of constant columns and of voltages, and share of rows with three voltages. The
-# simulator's battery has three voltages in 97 % of the rows of one flight. With a real battery, at most 5 % share one.
+# Smallest numbers of rows for the tests of constant columns and of voltages, and share of the rows that have one of the
+# three most frequent voltages. For the simulator's battery, the share was 97 % on one flight. For a real battery, a
+# single voltage has at most 5 %.
 _FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
 
 SIMULATED = Cause(

@@ -85,7 +85,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
 def _streams(
     settings: FlightFile, flight: Path, logs_root: Path | None, channel: str | None
 ) -> tuple[Stream, IngestedFile, Stream, bool]:
-    """Return the telemetry with the most rows, the file of the chosen levels, these levels, and if a log has a lock."""
+    """Return the longest telemetry, the file of the chosen levels, these levels, and whether a log contains a lock."""
     streams = [(f, stream) for f in read_logs(settings, flight.parent, logs_root) for stream in f.result.streams]
     vehicles = [s for _, s in streams if s.kind == "telemetry"]
     levels = {s.channel: (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}

@@ -66,7 +66,7 @@ _MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 # A prediction is refused as a prediction of another area if all its positions are farther from the site's origin [m].
 _FAR_M = 50_000.0
 
-# A larger level or loss [dB] is a fill value: no link of radios loses 400 dB.
+# A larger level or loss [dB] is a fill value: no radio link loses 400 dB.
 _MOST_DB = 400.0
 
 # Positions that are all closer than this to the height of the take-off ground are not a flight [m].
@@ -524,7 +524,7 @@ def _means(model: str, cards: Entries) -> dict[str, Any]:
 
 
 def _sentence(given: ForeignPrediction, series: Entries, common: Entries, means: Entries) -> str:
-    """Return both errors, whether the difference is significant, the errors as predicted, and the scored samples."""
+    """Return the result in words: both errors, the significance of their difference, and the number of samples."""
     mean, errors = means[0], {row["model"]: row["rmse_offset_db"] for row in means}
     text = f"{given.path.name}: RMSE {mean['rmse_offset_db']:.1f} dB after one offset per channel"
     if referee.OURS in errors:
@@ -571,7 +571,7 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> dict
     name = given.path.name
     # by model: its columns, whether it has the reference of the log, and the samples that it covers
     models = {name: (predicted, given.absolute(item.unit), near)}
-    if not item.training:  # its antennas know these samples
+    if not item.training:  # its antennas were learned from these samples
         models[referee.OURS] = {"level": item.simulated_dbm}, item.unit == "dBm", same
     models |= {BASELINE_TITLE[key]: ({"level": of.level_dbm}, False, same) for key, of in item.baselines.items()}
     seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")

@@ -550,7 +550,7 @@ def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
 
 
 def calibrate_command(path: Path, further: Sequence[Path], into_site: str | None) -> str:
-    """Return the command that learns the same again, with paths as the user typed them."""
+    """Return the command that repeats a calibration, with paths as the user typed them."""
     words: list[str | Path] = [path, *further, *([] if into_site is None else ["--into-site", into_site])]
     return f"aerpaw-cmp calibrate {' '.join(map(typed, words))}"
 

@@ -200,7 +200,7 @@ class WebServer(ThreadingHTTPServer):
             time.sleep(self.limits.tick_s)
 
     def server_bind(self) -> None:
-        """Bind without the look-up of this computer's name, which may ask the network."""
+        """Bind without looking up the name of this computer, which may need the network."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()

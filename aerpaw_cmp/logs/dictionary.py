@@ -21,7 +21,7 @@ from ..common.units import BoolArray, FloatArray
 from .records import Kind
 
 # Numbers that Android, modems, autopilots and scripts write for "not available".
-# They are the ends of integer types, also of 28 bits (LTE cell identity) and 16 bits (MAVLink), and -999 of scripts.
+# They are the ends of integer types, including 28 bits (LTE cell identity) and 16 bits (MAVLink), and -999 of scripts.
 UNAVAILABLE = (2147483647.0, -2147483648.0, 9223372036854775807.0, 268435455.0, 65535.0, -32768.0, -999.0, -9999.0)
 _ANY = (-np.inf, np.inf)
 
@@ -127,7 +127,8 @@ class Meaning:
     indirect : bool
         True for the uplink, a statistic or a model: the receiver did not measure such a level.
     part : str
-        ``mean`` of a level averaged over time, ``port`` of one receive port alone; empty for the cell's own level.
+        ``mean`` for a level averaged over time, ``port`` for that of a single receive port, empty for the cell's own
+        level.
     """
 
     quantity: Quantity
@@ -220,7 +221,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     return Meaning(row, unit, rat, place, indirect=PATTERNS["indirect"].search(text) is not None, part=part)
 
 
-# Words that pairs of an identity and a level do not share, or that only name the radio access or the serving cell.
+# Words that are ignored when the names of an identity and a level are paired: statistics, radio access, serving cell.
 _UNPAIRED = re.compile(
     rf"{PATTERNS['mean'].pattern}|\b(nr|ss|lte|4g|5g|cell|serving|primary|pcell|pscell|spcell|dbm?)\b"
 )
@@ -275,7 +276,8 @@ def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning |
         shared = {} if what is None else cells.get(("identity", what.place), {})
         if what is not None and rest in shared and rest in cells.get(("level", what.place), {}):
             several = any(shared[rest] & rats for other, rats in shared.items() if other != rest)
-            # a target with an identity is the cell of a handover; without one, it is the goal of a model
+            # a "target" with an identity is the target cell of a handover; without an identity, it is the target of a
+            # model
             indirect = what.indirect and PATTERNS["indirect"].search(rest.replace("target", "")) is not None
             what = replace(what, place=f"cell {rest}" if several and rest else what.place, indirect=indirect)
         placed.append(what)

@@ -147,7 +147,7 @@ class Member:
     size : int
         Size after decompression according to the archive [bytes].
     read : callable
-        Return the content, all of it or at most the given number of bytes.
+        Function that returns the content, or at most the given number of bytes of it.
     """
 
     name: str

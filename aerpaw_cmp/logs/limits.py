@@ -263,8 +263,8 @@ LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     for flag, ranges in dictionary.LIMITS.items()
 }
 
-# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight receives 30 dBm; a ratio to the noise is
-# wider.
+# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight receives 30 dBm; the range of a ratio to the
+# noise is wider.
 LEVEL_DB = {"dBm": (-200.0, 30.0), "dB": (-200.0, 200.0)}
 
 # Levels re full scale minus the gain: real sounder logs reach 33 dB.

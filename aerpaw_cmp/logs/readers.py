@@ -67,8 +67,8 @@ class ReadOptions:
     file_name : str
         Name of the log without folders, set by ``ingest``, for formats whose content is ambiguous.
     neighbour : callable, optional
-        Return the content of another file in the log's folder by its name, or None if it is missing. Set by ``ingest``,
-        for formats with samples in a second file.
+        Function that returns the content of another file in the log's folder by its name, or None if it is missing. Set
+        by ``ingest``, for formats with samples in a second file.
 
     Raises
     ------

@@ -205,7 +205,8 @@ def matched(
         MULTILINE, from ``^`` to ``\r?$``, unable to cross a line end, every repetition bounded; named groups, one of
         them ``time``.
     reason : callable
-        Return why a line that does not match is rejected, or None for a header, a comment or other console output.
+        Function that returns why a line that does not match is rejected, or None for a header, comment or console
+        output.
     skip : callable, optional
         Mask of the matching rows (0-based lines) that are comments.
     options : ReadOptions
@@ -237,8 +238,8 @@ class OtherLines:
     Parameters
     ----------
     reason : callable
-        Return why a line is rejected, or None for a header, a comment or other console output. By default, no line is
-        rejected.
+        Function that returns why a line is rejected, or None for a header, a comment or other console output. By
+        default, no line is rejected.
     rejected : iterable of RejectedLine
         Lines that were rejected before.
     comments : int array, optional

@@ -213,7 +213,7 @@ def remainder(
     accepted : int array
         0-based numbers of the lines with records.
     reason : callable
-        Return why a line is rejected, or None for a header or comment.
+        Function that returns why a line is rejected, or None for a header or comment.
     blank : int array, optional
         0-based numbers already known to be headers or comments.
 
@@ -245,7 +245,7 @@ def columns(groups: list[tuple[bytes, ...]], count: int) -> list[AnyArray]:
 
 
 def cells(texts: Sequence[bytes]) -> AnyArray:
-    """Return texts as an array of bytes, also for an empty list."""
+    """Return texts as an array of bytes. An empty list becomes an empty array of bytes."""
     return np.array(texts or [b""], dtype=np.bytes_)[: len(texts)]
 
 

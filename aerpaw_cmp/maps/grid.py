@@ -72,7 +72,9 @@ class Grid:
 
     @classmethod
     def over_area(cls, area_m: tuple[float, float, float, float], spacing_m: float = PAPER_SPACING_M) -> Grid:
-        """Return cells of ``spacing_m`` centred in ``(east_min, east_max, north_min, north_max)``, without a remainder.
+        """Return the complete cells of ``spacing_m`` that fit into an area, centred in it.
+
+        The area is ``(east_min, east_max, north_min, north_max)`` [m].
 
         Raises
         ------
@@ -495,7 +497,7 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
 
 
 def _within(low: float, high: float, unit: str, name: str, cause: str, default: float | None = None) -> Any:
-    """Return a field with its smallest and largest value, and the likely cause of a value outside of this range."""
+    """Return a dataclass field with its range, and the likely cause of a value outside this range."""
     return field(default=default, metadata={"range": (low, high, unit, name, cause)})
 
 

@@ -340,7 +340,7 @@ class TileStore:
         return path
 
     def remove(self) -> None:
-        """Remove all tile files, also those of killed runs with other settings, and the folder if it is then empty."""
+        """Remove all tile files, including those of killed runs with other settings, and the empty folder."""
         with suppress(OSError):  # the results are complete, and the next run removes the files
             for place in self.folder.iterdir():
                 if _TILE_FILE.fullmatch(place.name):

@@ -1,10 +1,10 @@
 """Buildings, forests and geofences from map files: classified, projected, repaired, with a list of all actions.
 
 The height of a building is its ``height`` tag, else ``building:levels`` times 3 m, else the height of the outline
-around a part, else a default. The number of default heights is reported. Parts of a building replace its outline where
-they are. Overlapping buildings of equal height are joined; otherwise the higher one covers the ground. Holes are
-retained. Slivers and duplicates are removed. Single trees have their tagged sizes, and tree rows become trees along
-their line.
+around a part, else a default. The number of default heights is reported. Within the area of its parts, a building's
+outline is replaced by them. Overlapping buildings of equal height are joined; otherwise the higher one covers the
+ground. Holes are retained. Slivers and duplicates are removed. Single trees have their tagged sizes, and tree rows
+become trees along their line.
 """
 
 from __future__ import annotations

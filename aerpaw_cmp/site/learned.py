@@ -386,7 +386,7 @@ def read_learned(site: str | Path) -> Learned:
 
 
 def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | None]:
-    """Read the index in a folder of learned models, also if it is damaged or values of an entry were edited.
+    """Read the index in a folder of learned models, even if it is damaged or values of an entry were edited.
 
     Returns
     -------
@@ -453,7 +453,7 @@ class _AnyEntries(BaseModel):
 def _entry_of(block: str, name: str, damage: UsageError) -> Entry | str:
     """Return the entry in its lines of an index, or the command that learns it again if these lines are damaged.
 
-    Raise ``damage`` if they are as another version of this program wrote them.
+    Raise ``damage`` if another version of this program wrote the lines.
     """
     text, values = f"entries:\n{block}", dict[str, Any]()
     with suppress(UsageError):
@@ -574,7 +574,7 @@ LEARNED = "# aerpaw-cmp calibrate: "
 
 
 def _is_table(place: Path) -> bool:
-    """Check whether a file is a table of a calibration or a rank receiver, also if it is truncated."""
+    """Check whether a file is a table of a calibration or a rank receiver, even if it is truncated."""
     with suppress(InputError, OSError, zlib.error):
         content = read_bounded(place, LARGEST_TABLE, "a table")
         if content.startswith(b"\x1f\x8b"):

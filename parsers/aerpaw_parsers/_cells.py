@@ -90,7 +90,8 @@ def streams(
     more : mapping, optional
         Further attributes of the cells; the keys are values of ``more`` in the readings.
     unit : str
-        Unit of the levels. Many programs write dB for dBm, so that dB are of full scale only if they cannot be dBm.
+        Unit of the levels. Many programs write dB for dBm. Values in dB are therefore taken as dB re full scale only if
+        they cannot be dBm.
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
@@ -158,7 +159,7 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
         rows.warnings.append(f"{cell}: {levels} of {_END_DBM:g} dBm, none within 10 dB above: read as out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI is below RSRP, which is impossible: are the columns swapped?")
-    # a level that is too high, unlike a missing one, says nothing about the coverage
+    # a level that is too high, unlike a missing one, contains no information about coverage
     high = outside & (level > _RANGE_DBM[1]) & ~np.isin(level, (0.0, *dictionary.UNAVAILABLE))
     add_flag(flag, high, "level_out_of_range")
     add_flag(flag, outside & ~high, "out_of_coverage")

@@ -142,7 +142,7 @@ _ANGLE = re.compile(rf"([NSEW]?) ?[-+]?[\d.]+(?:{_MARKS}{{1,3}}[\d.]+){{0,2}}{_M
 
 
 def _angle(text: str) -> tuple[float, str]:
-    """Return the number and unit of a position, also in degrees, minutes and seconds and with a hemisphere."""
+    """Return number and unit of a position, which can be in degrees, minutes and seconds or with a hemisphere."""
     value, unit = _number(text)
     written = _ANGLE.fullmatch(text) if np.isnan(value) or unit == "w" else None
     if written is None:
@@ -404,7 +404,7 @@ class Sheet:
         return values
 
     def _angles(self, column: int, quantity: dictionary.Quantity, values: FloatArray) -> FloatArray:
-        """Return positions in degrees, also from MAVLink's integers and NMEA's degrees and minutes, with their sign."""
+        """Return signed positions in degrees. MAVLink's integers and NMEA's degrees and minutes are converted."""
         if quantity.role != "position":
             return values
         if not dictionary.is_unit(self.unit(column)) and (form := dictionary.angle_form(values, quantity)):
@@ -444,7 +444,7 @@ class Sheet:
         left = [i for i in range(len(self.names)) if i not in self.used and self._is_of_interest(i)]
         shown = ", ".join(repr(self.names[i]) for i in left[:_MOST_NAMED])
         more = f" and {len(left) - _MOST_NAMED} more" if left[_MOST_NAMED:] else ""
-        # nobody needs the conversion of a column that is not read
+        # omit remarks about the conversion of a column that is not read
         idle = {i for i, _ in enumerate(self.names) if i not in self.used and self.unit(i) in dictionary.ACROSS_50_OHM}
         said = [text for i, text in sorted(self.notes.items()) if i not in idle]
         if left:

@@ -292,7 +292,7 @@ def in_seconds(text: str) -> str:
 
 
 def zone_of_cell(text: str) -> str:
-    """Return the zone in a cell of a column of zones, also from hours, minutes or seconds east of UTC.
+    """Return the zone in a cell of a column of zones: a name, or hours, minutes or seconds east of UTC.
 
     Examples
     --------

@@ -109,7 +109,7 @@ class _Cell:
 _IDENTITY = ("pci", "arfcn")
 # Columns are separate series if they repeat a cell of their row in more than this share of the rows.
 _TWICE = 0.3
-# Prefixes of places with a secondary carrier, which always is a cell of its own.
+# Prefixes of places with a secondary carrier, which is always a separate cell.
 _SECONDARY = ("scell", "secondary")
 # Prefixes of devices and SIMs, whose cells are separate series.
 _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")

@@ -1,6 +1,6 @@
 """GPX tracks of phones, loggers and Nemo: ``<trkpt lat lon><ele><time>``.
 
-The file is read by patterns and not as XML: a parser that resolves entities is a risk with a file from elsewhere.
+The file is read by patterns and not as XML: a parser that resolves entities is a risk with an untrusted file.
 Elements and attributes inside a point, such as those of its extensions, are columns of a table: levels among them are
 read. Nemo Handy writes times of the day without a date (``T14:13:17.853Z``), local in spite of the Z: their date is
 that of the file name. Elevations become heights above the first point.

@@ -1,7 +1,7 @@
 """Measurements of a Keysight Nemo phone, as KML: one placemark description per report, one quantity per file.
 
 Only the description lines are read, each with one report. They are read by patterns and not as XML, because a parser
-that resolves entities is a risk with a file from elsewhere. All other lines are markup and count as comments.
+that resolves entities is a risk with an untrusted file. All other lines are markup and count as comments.
 """
 
 from __future__ import annotations

@@ -371,7 +371,7 @@ def _key(sequence: Sequence[Mirror]) -> tuple[tuple[float, ...], ...]:
 
 
 def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
-    """Choose ``count`` poses of ``chosen`` that together meet as many faces as possible."""
+    """Choose ``count`` poses of ``chosen`` that together have as many different paths as possible."""
     if len(chosen) <= count:
         return chosen
     kinds: dict[int, set[tuple[int, ...]]] = {int(row): set() for row in chosen}
@@ -383,7 +383,7 @@ def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
     picked: list[int] = []
     met: set[tuple[int, ...]] = set()
     candidates = list(kinds)
-    # greedy: take the pose that meets most faces not met yet; an optimal cover is not needed
+    # greedy: take the pose with the most sequences of faces that are new; an optimal cover is not needed
     while len(picked) < count:
         best = max(candidates, key=lambda row: (len(kinds[row] - met), len(kinds[row])))
         picked.append(best)
@@ -579,7 +579,7 @@ def _link_error(
 def _lacking(
     site: Site, replay: Replay, theirs: PathSet, faces: Faces, rows: IntArray, few: Poses, expected: Expected
 ) -> FieldAudit:
-    """Count paths that only Sionna has: missing if they certainly exist, else doubtful because of its float32."""
+    """Count paths that only Sionna has: missing if they certainly exist, else doubtful because Sionna uses float32."""
     # use a wider margin, because float32 may differ within 2 mm
     verdicts = _verdicts(site, replay, theirs, faces, few, rows, expected, _SIONNA_MARGIN_M)
     missing = verdicts.count(True)

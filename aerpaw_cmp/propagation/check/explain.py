@@ -177,7 +177,7 @@ def _explained(
         "UAV antenna",
         "polarisation",
     ]
-    terms = {name: float(step) + 0.0 for name, step in zip(names, np.round(steps, 12), strict=True)}  # no minus zero
+    terms = {name: float(step) + 0.0 for name, step in zip(names, np.round(steps, 12), strict=True)}  # no -0.0
     terms |= {name: 0.0 - loss for name, loss in further_db.items()}
     corners = np.concatenate([source_m[None], path.vertices_m[0, :depth], target_m[None]])
     legs = np.diff(corners, axis=0)

@@ -297,7 +297,7 @@ class _Ends:
     rss: LinkSettings
     channels: dict[str, LinkSettings]
     cautions: list[Caution] = field(default_factory=list)
-    used: set[str] = field(default_factory=set)
+    used: dict[str, Named] = field(default_factory=dict)
 
     def link(self, channel: str | None) -> LinkSettings:
         """Return the link of a channel: ``link.rss`` for None and for a channel without an entry."""
@@ -319,7 +319,7 @@ class _Ends:
             self.cautions.append(Caution(key=f"antennas.{key}", channel=channel, text=text, used=True))
         array = ArraySettings(antenna=AntennaSettings(model="sphere", file=str(file), learned=known))
         end: dict[str, Any] = {"uav": array} if key == "uav" else {"towers": {**link.towers, tower: array}}
-        self.used.add(key)
+        self.used[key] = named
         if channel is None:
             self.rss = link.model_copy(update=end)
         else:
@@ -367,7 +367,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
     if receiver is not None and "/" in receiver and not (folder / receiver).is_file():
         content["rank"] = settings.rank.model_copy(update={"receiver": _receiver(settings, receiver, folder, ends)})
     lent = ends.channels.keys() - settings.link.channels.keys()
-    return settings.changed(content, cautions=ends.cautions, lent=lent) if content or ends.cautions else settings
+    return settings.changed(content, cautions=ends.cautions, learned=ends.used, lent=lent)
 
 
 def antennas_used(series: Sequence[tuple[str, str, LinkSettings]]) -> tuple[str, ...]:

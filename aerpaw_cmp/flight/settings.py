@@ -27,7 +27,7 @@ from ..logs.records import Kind
 from ..propagation import geometry
 from ..propagation.options import Diffraction
 from ..site.antennas import Isotropic
-from ..site.learned import BAND, LearnedAntenna, Written, check_band, read_pair, read_sphere_csv
+from ..site.learned import BAND, LearnedAntenna, Named, Written, check_band, read_pair, read_sphere_csv
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -576,6 +576,7 @@ class FlightFile(StrictModel):
     rank: RankSettings = RankSettings()
     report: ReportSettings = ReportSettings()
     _cautions: tuple[Caution, ...] = PrivateAttr(())
+    _learned: Mapping[str, Named] = PrivateAttr({})
     _lent: frozenset[str] = PrivateAttr(frozenset())
     _rank_rt: RtSettings | None = PrivateAttr(None)
 
@@ -583,6 +584,11 @@ class FlightFile(StrictModel):
     def cautions(self) -> tuple[Caution, ...]:
         """The warnings about named learned antennas and receivers. Those that do not fit are not used."""
         return self._cautions
+
+    @property
+    def learned(self) -> Mapping[str, Named]:
+        """The learned models that ``antennas`` names, by its keys."""
+        return {key: named for key, named in self._learned.items() if key in self.antennas}
 
     @property
     def rss_attitude(self) -> str:
@@ -609,11 +615,17 @@ class FlightFile(StrictModel):
         return self._lent
 
     def changed(
-        self, content: Mapping[str, Any], *, cautions: Iterable[Caution] | None = None, lent: Iterable[str] = ()
+        self,
+        content: Mapping[str, Any],
+        *,
+        cautions: Iterable[Caution] | None = None,
+        learned: Mapping[str, Named] | None = None,
+        lent: Iterable[str] = (),
     ) -> FlightFile:
         """Return a copy of the settings with new values for some top-level keys, which are not checked."""
         other = self.model_copy(update=dict(content))
         other._cautions = self._cautions if cautions is None else tuple(cautions)
+        other._learned = self._learned if learned is None else learned
         other._lent = self._lent | frozenset(lent)
         return other
 
@@ -744,7 +756,8 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
     here = {"rank.receiver"} if "receiver" in known.get("rank", {}) else set[str]()
     cautions = [u for u in settings.cautions if u.key not in here and not _replaced(u.key, taught, u.channel)]
     whole._rank_rt = settings.rt
-    return whole.changed({}, cautions=cautions, lent={*settings.lent, *(taught.keys() - settings.link.channels.keys())})
+    lent = {*settings.lent, *(taught.keys() - settings.link.channels.keys())}
+    return whole.changed({}, cautions=cautions, learned=settings.learned, lent=lent)
 
 
 def _replaced(key: str, taught: Mapping[str, Any], channel: str | None = None) -> bool:

@@ -348,7 +348,7 @@ def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore 
     """Return the expected error on another flight of this kind, unless this flight contradicts it."""
     gain = case.replayed.learned
     flown = None if gain is None else (case.replayed.poses.position_m, gain.sd_db)
-    errors, kind = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder, flown)
+    errors, kind = errors_elsewhere(case.data.settings.learned, case.series, flown)
     # the errors of a receiver were measured with the antennas of its own flights
     lock = None if kind == ALONE else _lock(case)
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:

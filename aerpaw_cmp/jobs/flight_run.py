@@ -271,8 +271,8 @@ class _ModelSearch:
 
     def _by_flights_left_out(self, comparison: FlightComparison) -> FlightComparison:
         """Recommend the learned model as calibrated, if it beats free space on held-out flights."""
-        antennas = (self._offer or self._data.settings).antennas
-        errors = [errors_elsewhere(antennas, series, self._data.folder)[0] for series in self._data.rss]
+        antennas = (self._offer or self._data.settings).learned
+        errors = [errors_elsewhere(antennas, series)[0] for series in self._data.rss]
         known = [error for error in errors if error is not None]
         if len(known) < len(errors) or not known:
             return comparison

@@ -10,7 +10,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..common.errors import InputError, UsageError
 from ..common.units import FOOT_M, AnyArray, FloatArray
 from ..compare import level as rss
 from ..compare.causes import CATCH_ALL, OF_DIRECTION, SHOWN_DB, flight_cause, gains_by_direction, slow_levels
@@ -26,7 +25,7 @@ from ..logs.limits import path_of
 from ..logs.records import Stream
 from ..propagation.field.baselines import free_space_dbm
 from ..site.antennas import Isotropic
-from ..site.learned import LearnedSeries, SpherePattern, find_named
+from ..site.learned import LearnedSeries, SpherePattern
 from ..site.site import Site
 
 _Key = TypeVar("_Key")
@@ -205,16 +204,10 @@ _GOOD_DB = 1.0
 
 
 def _learned_series(data: FlightData, series: RssSeries) -> LearnedSeries | None:
-    """Return the learned antenna of a series if the antenna has a health."""
-    antennas = data.settings.antennas
-    name = antennas.get(f"{series.tower}.{series.channel}")
-    if name is None or "uav" not in antennas:
-        return None
-    try:
-        found = find_named(name, data.folder).antenna("tower", series.link.carrier_hz)
-    except (InputError, UsageError):
-        return None
-    return found if found is not None and found.health is not None else None
+    """Return the learned antenna of a series, or None without learned antennas at both ends."""
+    antennas = data.settings.learned
+    named = antennas.get(f"{series.tower}.{series.channel}") if "uav" in antennas else None
+    return None if named is None else named.antenna("tower", series.link.carrier_hz)
 
 
 def _evidence(

@@ -510,7 +510,7 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
     """Held-out flights had 3.5 dB, or 7.7 dB with the floor. If the interval begins above, there is another cause."""
     errors = Errors(series=2, rmse_db=3.5, rmse_4s_db=2.8, free_space_rmse_db=6.1, inside_90=0.9)
     monkeypatch.setattr(compare_flight, "errors_elsewhere", lambda *_: (errors, "at a height that was not flown"))
-    data = SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path())
+    data = SimpleNamespace(settings=SimpleNamespace(learned={}))
     lock = SimpleNamespace(floor_rmse_db=7.7, free_space_floor_rmse_db=9.9)
     monkeypatch.setattr(compare_flight, "lock_elsewhere", lambda *_: lock)
     locks = floor_low_db is not None
@@ -541,7 +541,7 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     monkeypatch.setattr(compare_flight, "lock_elsewhere", lambda *_: lock)
     case = SimpleNamespace(
         series=SimpleNamespace(locked=np.array([1.0, 1.0, 0.0]), link=SimpleNamespace(transmit_power_dbm=40.0)),
-        data=SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path()),
+        data=SimpleNamespace(settings=SimpleNamespace(learned={})),
         levels=SimpleNamespace(simulated_db=np.array([-50.0, -60.0, -70.0])),
     )
     score = SimpleNamespace(residual_db=np.array([2.0, 4.0, -9.0]), offset_db=-5.0)

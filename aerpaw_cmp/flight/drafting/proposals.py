@@ -970,7 +970,7 @@ def offered(data: FlightData) -> FlightFile | None:
 
 
 def errors_elsewhere(
-    antennas: Mapping[str, str], series: RssSeries, folder: Path, flown: tuple[FloatArray, FloatArray] | None = None
+    antennas: Mapping[str, learned.Named], series: RssSeries, flown: tuple[FloatArray, FloatArray] | None = None
 ) -> tuple[learned.Errors | None, str]:
     """Return the errors of learned antennas on held-out flights like that of a series, and a phrase for their kind.
 
@@ -978,11 +978,9 @@ def errors_elsewhere(
 
     Parameters
     ----------
-    antennas : mapping of str to str
-        Names of the antennas in the flight file.
+    antennas : mapping of str to Named
+        The learned antennas that the flight file names, by its keys.
     series : RssSeries
-    folder : Path
-        Folder of the flight file.
     flown : (n, 3) and (n,), optional
         Positions [m], and standard deviation of the learned gain there [dB]. They show whether the height or the
         directions are new, which have larger errors.
@@ -993,15 +991,10 @@ def errors_elsewhere(
     str
         Kind of the held-out flights, such as ``"on another flight"``.
     """
-    name = antennas.get(f"{series.tower}.{series.channel}")
     if "uav" not in antennas:
         return None, ""
-    try:
-        named = learned.find_named(name or antennas["uav"], folder)
-    except (InputError, UsageError):
-        return None, ""
-    antenna = None if name is None else named.antenna("tower", series.link.carrier_hz)
-    return _expected(named.entry, antenna, *(flown or ()))
+    named = antennas.get(f"{series.tower}.{series.channel}", antennas["uav"])
+    return _expected(named.entry, named.antenna("tower", series.link.carrier_hz), *(flown or ()))
 
 
 # Kind of the expected error with the antenna of the UAV alone.
@@ -1037,7 +1030,7 @@ def lock_elsewhere(data: FlightData, series: RssSeries) -> learned.LearnedLock |
 
     None if the receiver never loses its lock, is not known, or was learned from this series.
     """
-    receiver, uav = data.settings.logs[int(series.log[0])].receiver, data.settings.antennas.get("uav")
+    receiver, uav = data.settings.logs[int(series.log[0])].receiver, data.settings.learned.get("uav")
     with suppress(InputError, UsageError):
         named = [item for item in all_learned_links(data.site_place) if item.receiver == receiver] if receiver else []
         if named:
@@ -1045,8 +1038,7 @@ def lock_elsewhere(data: FlightData, series: RssSeries) -> learned.LearnedLock |
             known = any(item.learned_from(log, mark) for item in named for log in own)
             return None if known else named[-1].series.lock
         if uav is not None:
-            entry = learned.find_named(uav, data.folder).entry
-            return next((item.lock for item in entry.series if item.lock is not None), None)
+            return next((item.lock for item in uav.entry.series if item.lock is not None), None)
     return None
 
 

@@ -323,6 +323,12 @@ def held_while_weak(t: Table, size: float, draw: Draw) -> None:
         take(t, np.maximum.accumulate(np.where(good, np.arange(len(good)), 0)), [name])
 
 
+def path_losses(t: Table, size: float, draw: Draw) -> None:
+    """The log contains path losses, the transmit power minus the level."""
+    for name in levels(t):
+        t[name] = size - t[name]
+
+
 KINDS: Mapping[str, Outside] = {
     "ratcheting gain control": Outside(ratchet, (4.0, 9.0, 18.0), "dB", ("gain step",)),
     "intermittent contact": Outside(contact, (5.0, 10.0, 20.0), "dB"),
@@ -354,4 +360,5 @@ KINDS: Mapping[str, Outside] = {
     "driving transmitter": Outside(tower_drives, (80.0, 200.0, 500.0), "m", ("place", "tower")),
     "two receivers in a column": Outside(two_receivers, (4.0, 8.0, 16.0), "dB"),
     "readings held while weak": Outside(held_while_weak, (0.15, 0.35, 0.6), "share", ("floor", "no detection", "lock")),
+    "path losses": Outside(path_losses, (0.0, 10.0, 40.0), "dBm", ("sign",)),
 }

@@ -320,6 +320,8 @@ _CONDITIONS = {
     # high limits, because the best of many positions explains a part of many errors
     "place": _Conditions(lead=4.5, share=0.3, part=0.75, of_tower=True, most_left=1.0, follows=0.9),
     "saturation": _Conditions(part=0.5, most_left=1.0),
+    # a high limit, because an antenna pattern that is not modelled can also reverse the slope
+    "sign": _Conditions(share=0.5, follows=0.9),
     "telemetry": _Conditions(part=0.5, of_uav=True, most_left=1.0, follows=0.9),
     "tower": _Conditions(part=0.65, follows=1.0, most_left=math.inf),
 }
@@ -466,7 +468,7 @@ def _models(e: LevelEvidence) -> _Models:
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.parameters) for first, second in pairs]
     # if half or twice the decibels is a candidate, leave out unnamed slopes, which would explain the same error
-    named = any(m.gain > 0.0 and _names(m) & {"decibels", "exponent or decibels"} for m in alone)
+    named = any(m.gain > 0.0 and _names(m) & {"decibels", "exponent or decibels", "sign"} for m in alone)
     for first in likely:
         rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
         further = best_of(((first.trials[0], second) for second in rest), first.parameters)
@@ -853,7 +855,7 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield levels with half or twice the decibels, as if an amplitude were a power or the reverse.
+    """Yield levels with half or twice the decibels, as if an amplitude were a power or the reverse, or with minus them.
 
     The interval of the slope must support the factor, and a path-loss exponent and a gain over elevation, which change
     levels in the same way, must be much less likely.
@@ -879,12 +881,10 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
                 estimate=(2.0 * best, 2.0 * best - 3.92 * sd, 2.0 * best + 3.92 * sd),
             )  # fmt: skip
             return
-    for factor, words in ((0.5, "half"), (2.0, "twice"))[: 1 if alike else 2]:
-        sentence = f"the levels change by {words} the predicted decibels"
-        step = "check: 10 log10 of power, 20 log10 of amplitude"
+    for factor, (name, sentence, step) in _FACTORS.items():
         change_db, cost = (factor - 1.0) * e.predicted_db, 2.0 * _RARE + math.log(2.0)
-        trial = Trial(name="decibels", cost=cost, change_db=change_db, sentence=sentence, next_step=step)
-        if not _nearer(e, factor * e.predicted_db):
+        trial = Trial(name=name, cost=cost, change_db=change_db, sentence=sentence, next_step=step)
+        if not _nearer(e, factor * e.predicted_db) or (alike and factor == 2.0):
             continue
         fit = _fitted(e, trial)
         slope, *apart = (_fitted(e, other, at=fit.parameters).log_likelihood for other in others)
@@ -897,19 +897,25 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     yield from (others[0], *others[2:])
 
 
-# Prior standard deviation of the slope of measured over predicted levels.
+# Cause, sentence and next step by slope of measured over predicted levels, and the prior standard deviation of a slope.
+_POWERS = "check: 10 log10 of power, 20 log10 of amplitude"
+_FACTORS = {
+    -1.0: ("sign", "the values rise where the predicted level falls, as path losses do", "negate them in the log"),
+    0.5: ("decibels", "the levels change by half the predicted decibels", _POWERS),
+    2.0: ("decibels", "the levels change by twice the predicted decibels", _POWERS),
+}
 _SLOPE = 0.5
 # Least slope that an exponent explains, because heights and antennas change the slope by less, and largest height of a
 # receiver among obstacles [m].
 _STEEP, _NEAR_GROUND_M = 1.25, 10.0
-# Largest relative difference of a slope from 0.5 and 2, for any antennas and for learned ones. The slope of learned
+# Largest relative difference of a slope from these factors, for any antennas and for learned ones. The slope of learned
 # antennas is 0.95 to 1.09 on held-out flights of dataset 12, and 0.9 on the LTE flight at 50 m.
-_SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {0.5: 0.1, 2.0: 0.05}, {0.5: 0.12, 2.0: 0.1}
+_SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {-1.0: 0.25, 0.5: 0.1, 2.0: 0.05}, {-1.0: 0.25, 0.5: 0.12, 2.0: 0.1}
 
 
 def _is_slope(e: LevelEvidence, factor: float, at: NoiseParameters) -> bool:
     """Check whether the 95 % interval of the slope is near a factor."""
-    step = factor * (_LEARNED_SLOPE_SHARE if e.antenna == "learned" else _SLOPE_SHARE)[factor]
+    step = abs(factor) * (_LEARNED_SLOPE_SHARE if e.antenna == "learned" else _SLOPE_SHARE)[factor]
     best, sd = _slope(e, factor, step, at)
     return abs(best - factor) <= step and abs(best - factor) + 1.96 * sd < 2.0 * step
 

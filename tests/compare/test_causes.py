@@ -99,6 +99,7 @@ def _planted() -> dict[str, LevelEvidence]:
         "attitude": replace(sound, measured_db=level + 5.0 * np.sin(time**2), attitude_db={"logged": 5.0 * np.sin(time**2)}),
         "telemetry": replace(sound, measured_db=level + 5.0 * np.cos(time**2), misread_db={"in feet": 5.0 * np.cos(time**2)}),
         "decibels": replace(sound, measured_db=0.5 * level),
+        "sign": replace(sound, measured_db=-level),
         "height": replace(sound, measured_db=level + 5.0 * np.cos(time / 9.0), raised_db={60.0: 5.0 * np.cos(time / 9.0)}),
         "tower": replace(sound, measured_db=sound.other_towers_db["LW3"] + noise),
         "pattern": replace(sound, measured_db=level + 5.0 * np.sin(np.radians(2 * sound.uav_azimuth_deg))),
@@ -111,7 +112,7 @@ def _planted() -> dict[str, LevelEvidence]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["telemetry", "decibels", *(name for name in TROUBLES if name != "clock")])
+@pytest.mark.parametrize("name", ["telemetry", "decibels", "sign", *(name for name in TROUBLES if name != "clock")])
 def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
     evidence = _planted()[name]
     cause = flight_cause([evidence])
@@ -681,6 +682,15 @@ def test_another_slope_is_no_antenna_and_no_height() -> None:
     steep = sound.measured_db + 0.6 * sound.predicted_db
     height = {rise: 0.4 * rise / 40.0 * sound.predicted_db for rise in (-15.0, 15.0, 40.0)}
     assert _named(replace(sound, measured_db=steep, raised_db=height)) == NONE
+
+
+def test_a_pattern_or_noise_under_a_reversed_slope_is_no_path_loss() -> None:
+    """The slope must be known, and the opposite sign must explain half of the error."""
+    sound = _sound()
+    pattern = 8.0 * np.cos(np.radians(2.0 * sound.uav_azimuth_deg))
+    noise = np.random.default_rng(2).normal(0.0, 10.0, 300)
+    for other in (pattern, noise):
+        assert _named(replace(sound, measured_db=other - sound.measured_db)) == NONE
 
 
 @pytest.mark.parametrize(("slope", "words"), [

@@ -120,7 +120,7 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
         # a wrong option or argument; recognised by its method, because typer may contain its own copy of click
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "aerpaw-cmp"
-        return f"{command}: {wording().rstrip('.')}; '{command} --help' tells the options", 2
+        return f"{command}: {wording().rstrip('.')}; '{command} --help' lists the options", 2
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("aerpaw_cmp"):
         return f"aerpaw-cmp: the Python package '{error.name}' is not installed; 'make setup' installs everything", 1
     if isinstance(error, FileNotFoundError) and _is_homeless():
@@ -128,7 +128,7 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
     if isinstance(error, OSError) and error.errno in _UNUSABLE and error.filename:
         shown = os.fsdecode(error.filename)
         shown = shown if len(shown) <= LONGEST_NAME else f"{shown[:LONGEST_NAME]}..."
-        return f"aerpaw-cmp: {shown}: cannot be used ({error.strerror}); expected a file or folder of yours", 3
+        return f"aerpaw-cmp: {shown}: cannot be used ({error.strerror}); expected an accessible file or folder", 3
     kind = type(error).__name__
     return (
         f"aerpaw-cmp: internal error, {kind}: {str(error).strip() or 'no message'}\n"
@@ -232,7 +232,7 @@ def _code_of_output(code: int) -> int:
         return BROKEN_PIPE
     cause = "closed, or not open for writing" if fault.errno == errno.EBADF else "a full disk"
     print(
-        f"aerpaw-cmp: standard output does not take the results ({fault.strerror}). Likely cause: {cause}",
+        f"aerpaw-cmp: the results cannot be written to standard output ({fault.strerror}). Likely cause: {cause}",
         file=sys.stderr,
     )
     return OUTPUT_FAULT

@@ -173,7 +173,7 @@ def test_a_fault_of_ours_is_called_one(command_line, capsys, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["report"], 2, "aerpaw-cmp report: Missing argument 'flight'; 'aerpaw-cmp report --help' tells the options"),
+        (["report"], 2, "aerpaw-cmp report: Missing argument 'flight'; 'aerpaw-cmp report --help' lists the options"),
         (["report", "f.yaml", "--nope"], 2, "aerpaw-cmp report: No such option: --nope"),
         (["report", "f.yaml", "--batch", "many"], 2, "aerpaw-cmp report: "),
         (["report", "f.yaml", "--batch", "3"], 3, ""),
@@ -233,9 +233,9 @@ FULL = Path("/dev/full")
 @pytest.mark.parametrize(
     ("line", "redirect", "code", "said"),
     [
-        ("--help", ">/dev/full", 3, "standard output does not take the results (No space left on device)"),
-        ("formats", ">/dev/full", 3, "standard output does not take the results (No space left on device)"),
-        ("formats --json", ">&-", 3, "standard output does not take the results (Bad file descriptor)"),
+        ("--help", ">/dev/full", 3, "the results cannot be written to standard output (No space left on device)"),
+        ("formats", ">/dev/full", 3, "the results cannot be written to standard output (No space left on device)"),
+        ("formats --json", ">&-", 3, "the results cannot be written to standard output (Bad file descriptor)"),
         ("formats", "<&-", 0, ""),
         ("reprot", "2>&- >&-", 2, ""),
         ("reprot", "2>/dev/full >/dev/full", 2, ""),

@@ -160,7 +160,7 @@ def about_file(path: str | Path, line: int | None = None) -> Iterator[None]:
 
 
 _IN_WORDS: dict[Any, str] = {
-    RecursionError: "it is nested too deep",
+    RecursionError: "it is nested too deeply",
     MemoryError: "it does not fit in memory",
     UnicodeError: "it is not UTF-8 text",
 }

@@ -146,7 +146,7 @@ def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
     if len(numbers) % 3 or any(max(column) - min(column) > _AREA_DEG for column in list(zip(*threes, strict=True))[:2]):
         raise InputError(
             f"{len(numbers)} numbers separated only by commas, which are not triples longitude,latitude,altitude",
-            expected="a blank between places",
+            expected="a space between positions",
         )
     return threes
 

@@ -152,7 +152,7 @@ def _real(path: Path) -> Path:
     try:
         return Path(os.path.realpath(path))
     except (OSError, ValueError) as error:
-        raise UsageError(f"not a possible output name ({error})", path=path) from None
+        raise UsageError(f"this output name is not possible ({error})", path=path) from None
 
 
 # --- one file -------------------------------------------------------------------------------------

@@ -232,7 +232,7 @@ def _parse(text: str, path: str | Path | None) -> _Document:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        cause = "tabs cannot indent in YAML; use blanks" if _tab_indents(text, mark) else None
+        cause = "tabs cannot indent in YAML; use spaces" if _tab_indents(text, mark) else None
         # PyYAML calls control characters unacceptable
         if "unacceptable" in problem:
             cause = "a log or another binary file instead of the settings"

@@ -850,7 +850,7 @@ _RARE = 3.0
 def _cell(e: LevelEvidence) -> Iterator[Trial]:
     """Yield a level that changes with the serving cell."""
     if e.serving is not None and np.ptp(e.serving) > 0.5:
-        sentence, step = "the level steps where the phone changes its cell", "compare the cells separately"
+        sentence, step = "the level steps when the phone changes its serving cell", "compare the cells separately"
         yield Trial(name="cell", sentence=sentence, next_step=step, columns=_STEP_DB * e.serving[:, None])
 
 

@@ -116,7 +116,7 @@ def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Momen
     """
     measured, simulated = unmasked(measured_db), unmasked(simulated_db)
     if measured.shape != simulated.shape:
-        raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}: they must be pairs")
+        raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}; expected the same")
     finite = np.isfinite(measured) & np.isfinite(simulated)
     if not finite.any():
         return Moments(n=0, mean_db=float("nan"), variance_db2=float("nan"))

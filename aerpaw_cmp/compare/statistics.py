@@ -823,7 +823,7 @@ class PairedDifference:
         size = f"{abs(self.difference_db):.1f} dB"
         if self.verdict == "no interval":
             more = "more" if self.difference_db > 0 else "less"
-            return f"{size} {more} error than {other_model}, the flight is too short for an interval"
+            return f"{size} {more} error than {other_model}; the flight is too short for an interval"
         difference, low, high = map(Printed, (self.difference_db, *self.difference_ci95_db))
         if self.verdict == "not significant":
             corrected_for = "" if low <= 0.0 <= high else "; corrected for the number of channels"

@@ -503,7 +503,7 @@ def gather(
         warnings.append("rank.tower has no effect: no log has ranks without its own 'node'")
     if rank and settings.link.rank.bandwidth_hz is None:
         warnings.append(
-            "link.rank: no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"
+            "link.rank has no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"
         )
     cautions = check_names(settings, site, [(series.tower, series.channel) for _, series in rss])
     cautions += _unknown_receivers(settings, data.site_place)
@@ -708,7 +708,7 @@ def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
     return [
-        f"{shown} to the noise and not a level: compared as RSS over constant noise ('bandwidth_hz' "
+        f"{shown} to the noise, not a level, and compared as RSS over constant noise ('bandwidth_hz' "
         f"and 'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' next to the path "
         "excludes it)"
     ]
@@ -937,8 +937,8 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
             if path == later_path:
                 where = f"two streams of one log contain {what}"
                 cause = (
-                    "a log that is listed twice, or two cells or devices: name the tower's own by "
-                    "'cells: {STREAM: TOWER}', 'ingest --all' lists them"
+                    "a log that is listed twice, or two cells or devices: assign them to towers by "
+                    "'cells: {STREAM: TOWER}'; 'ingest --all' lists the streams"
                 )
             raise UsageError(
                 f"{where} at the same time or with different properties: {path!r} and {later_path!r}",

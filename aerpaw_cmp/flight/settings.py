@@ -98,7 +98,7 @@ class ArraySettings(StrictModel):
     def _of_its_layout(self) -> ArraySettings:
         for key, layout in (("elements", "linear"), ("positions_m", "custom")):
             if getattr(self, key) is not None and self.layout != layout:
-                raise ValueError(f"'{key}' belongs to layout '{layout}', and this is '{self.layout}'")
+                raise ValueError(f"'{key}' belongs to layout '{layout}', but the layout is '{self.layout}'")
         return self
 
     def positions(self, wavelength: float) -> FloatArray:

@@ -237,7 +237,7 @@ class TrackAccount:
         )
         usual_m, high_m = self.sparse_error_m
         sparse = (
-            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions between are interpolated, with a "
+            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions in between are interpolated, with a "
             f"median error of about {usual_m:.0f} m and {high_m:.0f} m in one of ten"
         )
         return (*([sparse] if self.sparse_s else []), *(f"{count} {text}" for count, text in reasons if count))

@@ -182,7 +182,7 @@ def carry_out(task: Task) -> Outcome:
         return failed_task(
             task,
             f"the worker on {platform.node()} sees other inputs or runs another version of the program than the "
-            f"process that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected are the same "
+            f"process that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected the same "
             "inputs and version everywhere",
         )
     start = time.perf_counter()

@@ -337,7 +337,7 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
             failed.append(f"{link}: the best offset is at the end of its search range")
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if (metrics.get("rt") or {}).get("not_audited"):
-        failed.append("audit: the replay was not audited; a warning has the reason")
+        failed.append("audit: the replay was not audited; a warning states the reason")
     if audit.get("missing_paths"):
         failed.append(
             f"audit: the engine misses {counted(audit['missing_paths'], 'path')} that {audit['reference']} finds"

@@ -168,7 +168,7 @@ class OutcomeStore:
         try:
             content = read_sealed(file, _SEAL)
         except ValueError:
-            self.warnings.append(f"a damaged outcome was not used, its task is computed again: {file}")
+            self.warnings.append(f"a damaged outcome was not used; its task is computed again: {file}")
             return None
         if content is None:
             return None

@@ -368,11 +368,11 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
         alarms["stale"] = f"no rank for more than {stale_s:g} s: is data flowing, and CSI reporting on?"
     if modem.predicts and now - modem.gps_s > lost_s:
         if modem.fix is not None and 0 <= modem.fix < 3:
-            alarms["gps"] = "GPS lost: the telemetry states no 3-D fix"
+            alarms["gps"] = "GPS lost: the telemetry reports no 3-D fix"
         elif modem.age_s is None:
             alarms["gps"] = "no position: the telemetry log has no lines yet"
         else:
-            alarms["gps"] = f"no position for more than {lost_s:g} s: the telemetry log does not reach the present"
+            alarms["gps"] = f"no position for more than {lost_s:g} s: the telemetry log is not up to date"
     if modem.status.disk_fault:
         alarms["disk"] = f"the log cannot be written: {modem.status.disk_fault}; records wait in memory"
     elif modem.status.disk_free_bytes is not None and modem.status.disk_free_bytes < _DISK_LOW_BYTES:

@@ -284,7 +284,7 @@ class SerialPort:
         return InputError(
             f"cannot be opened as a serial port ({os.strerror(number)})",
             expected="a serial port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
-            cause="the name of something else",
+            cause="the name of another device or file",
             path=path,
         )
 

@@ -278,9 +278,9 @@ class TelemetryFollower:
         streams = [stream for stream in result.streams if stream.kind == "telemetry"]
         if result.streams and not streams:
             raise InputError(
-                f"the log holds {result.streams[0].kind} records",
+                f"the log contains {result.streams[0].kind} records",
                 expected="telemetry",
-                cause="another log was named to be followed",
+                cause="another log was named as telemetry",
                 path=self.path,
             )
         newest_ns = self.samples[-1].utc_ns if self.samples else None

@@ -55,11 +55,11 @@ def _not_a_modem(path: Path, received: bytes) -> InputError:
     """Return the error for a port that does not answer ``AT``. The cause depends on the received bytes."""
     expected = "an answer to 'AT' (interface 02 or 03 of the modem)"
     if _NMEA.search(received):
-        sign, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the numbers moved"
+        sign, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the port numbers changed"
     elif received.count(0x7E) >= 1 and sum(b < 9 or b > 126 for b in received) > len(received) // 10:
         sign, cause = (
             "the port speaks HDLC frames: it is a DIAG port",
-            "interface 00 was given, or the numbers moved",
+            "interface 00 was given, or the port numbers changed",
         )
     elif received:
         excerpt = ascii(modem.Redactor().clean(received[:40].decode("latin-1"), cut=True))
@@ -209,7 +209,7 @@ class Tap:
         restored = self._restore_csi()
         self._close_port()
         if self._gap_open is not None:
-            self._close_gap("the session ended in the gap")
+            self._close_gap("the session ended during the gap")
         if self._worker is not None:
             self._worker.close()
             self._log_predictions()

@@ -457,7 +457,7 @@ def _outward() -> list[str]:
 def _refused(address: Address, error: OSError) -> UsageError:
     """Return the error for an address that cannot be used."""
     cause = {
-        errno.EADDRINUSE: "another tap or another server has this port",
+        errno.EADDRINUSE: "another tap or another server uses this port",
         errno.EACCES: "ports below 1024 require administrator rights",
         errno.EADDRNOTAVAIL: "this computer has no such address",
     }.get(error.errno or 0, "the name of another computer")

@@ -234,7 +234,7 @@ def _untarred(book: tarfile.TarFile, entry: tarfile.TarInfo, most: int | None) -
 def _member(name: str, size: int, path: str | Path, read: Callable[[int | None], bytes]) -> Member:
     """Return a member under a relative name, so that a flight.yaml can only name files inside the archive."""
     if ".." in name.split("/"):
-        return Member(name, 0, partial(_refused, "the member's name leads out of the archive", "a relative name", path))
+        return Member(name, 0, partial(_refused, "the member's name leaves the archive", "a relative name", path))
     return Member(name.lstrip("/"), size, read)
 
 

@@ -99,7 +99,7 @@ class ReadOptions:
             raise UsageError(
                 f"the unit {self.unit!r} of levels",
                 expected="dBm, dBFS or dB (a ratio to the noise)",
-                cause="a linear unit belongs into the name of the column, such as power_mw, and is converted",
+                cause="a linear unit belongs in the name of the column, such as power_mw, and is converted",
             )
         object.__setattr__(self, "unit", known)
 
@@ -197,7 +197,7 @@ def catalogue() -> tuple[Reader, ...]:
 
 
 def _accepts(reader: Reader, head: bytes) -> bool:
-    with blaming(reader.plugin, f"reader {reader.name!r} looked at a file"):
+    with blaming(reader.plugin, f"reader {reader.name!r} tested a file"):
         return reader.sniff(head)
 
 

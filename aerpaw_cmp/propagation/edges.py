@@ -205,7 +205,7 @@ class EdgePaths(Further):
     name: ClassVar[str] = "edge"
     missing: ClassVar[str] = (
         "diffraction over two edges, at the tips of edges, after a reflection off a wall, and with more than one "
-        "reflection on a side"
+        "reflection on either side"
     )
 
     pose: IntArray

@@ -627,7 +627,7 @@ def _shaped_ground(
     level, shaped, faces, unknown = on_terrain(
         site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz)
     )
-    words = "links over ground that the elevation model does not know: level ground reflects there"
+    words = "links over ground outside the elevation model: level ground is assumed there"
     # a tangent plane is valid only for the path for which it was computed
     more = np.zeros((len(scene.usable), len(faces) - len(scene.faces)), dtype=np.bool_)
     scene = replace(scene, faces=faces, usable=np.concatenate([scene.usable, more], axis=1))

@@ -377,9 +377,9 @@ def models_card(data: ReportData) -> Card:
         look="dense",
     )  # fmt: skip
     text = (
-        f"{words.models_verdict(data.models)} The flight is cut into eight areas. Each area is scored with the offset "
-        "of the other seven; nothing else is fitted. Each stage (antennas, trees, ground, buildings) adds its variants "
-        "to the best model so far."
+        f"{words.models_verdict(data.models)} The flight is divided into eight areas. Each area is scored with the "
+        "offset of the other seven; nothing else is fitted. Each stage (antennas, trees, ground, buildings) adds its "
+        "variants to the best model so far."
     )
     return Card(
         title=title, id="ladder", link="Models", text=[text], tables=[pooled],

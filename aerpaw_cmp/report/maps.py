@@ -589,7 +589,7 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
     levels = [item for item in layers if item.tower in ("", JOINT) or item.quantity == "RSS"]
     single = "layers of single towers"
     tries = [("", layers, 1), (f"{single} other than RSS", levels, 1), (single, joint, 1)]
-    thinned = ((f"{single}, and all but every {n}. cell of each row and column", joint, n) for n in itertools.count(2))
+    thinned = ((f"{single}, and all but one in {n} cells of each row and column", joint, n) for n in itertools.count(2))
     return next(
         content | {"left_out": left_out, "stride": stride}
         for left_out, chosen, stride in itertools.chain(tries, thinned)

@@ -584,7 +584,7 @@ _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
     (b"BZh", "bzip2-compressed data", "unpack it with bunzip2"),
     (b"\xff\xfe", "UTF-16 text", "save it as UTF-8"),
     (b"\xfe\xff", "UTF-16 text", "save it as UTF-8"),
-    (b"\x00\x00\x27\x0a", "a shapefile", "ogr2ogr -f GeoJSON -t_srs EPSG:4326 makes GeoJSON of it"),
+    (b"\x00\x00\x27\x0a", "a shapefile", "ogr2ogr -f GeoJSON -t_srs EPSG:4326 converts it to GeoJSON"),
     (b"SQLite format 3", "a GeoPackage or another SQLite file", "ogr2ogr -f GeoJSON -t_srs EPSG:4326 makes GeoJSON"),
 )
 

@@ -73,7 +73,7 @@ def read_ply(data: bytes) -> Mesh:
         # compare before an array is made, because a damaged header may promise more than fits into memory
         if count < 0 or place + count * record.itemsize > len(data):
             raise InputError(
-                f"the file ends before the {count} entries of '{name}' that its header promises",
+                f"the file ends before the {count} entries of '{name}' that its header declares",
                 cause="it was cut off, its faces are not triangles, or the header is damaged",
             )
         rows = np.frombuffer(data, record, count, place)
@@ -135,7 +135,7 @@ def _header(data: bytes) -> tuple[list[_Element], int]:
                 case ["property", item, name]:
                     elements[-1][2].append((name, _TYPES[item]))
         except (IndexError, KeyError, ValueError):
-            raise InputError(f"the header says '{line.strip()[:60]}'", expected="a PLY header", line=number) from None
+            raise InputError(f"the header has '{line.strip()[:60]}'", expected="a PLY header", line=number) from None
     if kind != "binary_little_endian":
         raise InputError(f"a PLY of format '{kind[:40]}'", expected=_MESH)
     return elements, data.find(b"\n", end) + 1

@@ -632,7 +632,7 @@ def _check_name(name: str, others: Iterable[str]) -> None:
     """Refuse a name that a map could not distinguish in its files from the nearest tower or from another tower."""
     in_files = re.sub(r"\W", "_", name)
     if name == NEAREST:
-        raise UsageError(f"a tower named '{name}'", expected="another name", cause="maps call the nearest tower so")
+        raise UsageError(f"a tower named '{name}'", expected="another name", cause="maps reserve this name")
     if twin := next((other for other in others if re.sub(r"\W", "_", other) == in_files), None):
         raise UsageError(
             f"towers '{twin}' and '{name}'",

@@ -197,7 +197,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
     level = next((i for name in names if (i := sheet.find(name)) is not None), level)
     if found and not _name_sources(table, [str(i) for i in found], None if level is None else sheet.numbers(level)):
         shown = ", ".join(repr(sheet.names[i]) for i in found)
-        rows.warnings.append(f"column {shown}: rows of one time differ in its values, but {_ASKED}")
+        rows.warnings.append(f"column {shown}: rows with the same time differ in its values, but {_ASKED}")
         found = []
     marks += found
     if key == "network" and unknown and level is not None:

@@ -433,7 +433,7 @@ def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
     if not words & {"rnti", "ue", "nprb", "prb", "prbs"}:
         return False
     rows.warnings.append(
-        "the table is from a scheduler of the uplink: its signal-to-noise ratios are not levels of the downlink"
+        "the table is from an uplink scheduler: its signal-to-noise ratios are not levels of the downlink"
     )
     return True
 
@@ -482,7 +482,7 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
         repeated = [name for i in others if re.fullmatch(re.escape(level) + r" \d+", name := sheet.names[i])]
         if repeated:
             shown = " and ".join(map(repr, [level, *repeated]))
-            rows.warnings.append(f"{shown} are separate series: nothing in the table says whose levels they are")
+            rows.warnings.append(f"{shown} are separate series: the table does not specify whose levels they are")
 
 
 def _assumed_units(sheet: _sheet.Sheet) -> Iterator[str]:

@@ -61,6 +61,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 READER = Reader(
-    name="iq_burst", title="I/Q burst of get_IQ.py (.mat), a folder of them is one log", kinds=("rss",),
+    name="iq_burst", title="I/Q burst of get_IQ.py (.mat); a folder of bursts is one log", kinds=("rss",),
     sample="results_3320000000_2000000_2025_01_01_12_00_07_250.mat", sniff=sniff, read=read, pieces=True,
 )  # fmt: skip

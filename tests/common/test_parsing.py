@@ -18,7 +18,7 @@ ROOM = Path(aerpaw_cmp.__file__).parent
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (RecursionError(), "it is nested too deep"),
+        (RecursionError(), "it is nested too deeply"),
         (ValueError("\x1b[2J" * 99), r"ValueError: \\x1b"),
         (MemoryError(), "it does not fit in memory"),
         (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x"), "it is not UTF-8 text"),

@@ -77,7 +77,7 @@ def test_another_day_a_ratio_and_relative_times_are_left_out(logs: Path) -> None
     left = {remark.split(": ")[1]: remark for remark in remarks if remark.startswith("left out: ")}
     assert set(left) == {"LW1/x_quality_log.txt", "LW2/USRP2_power_log.txt", "UAV/old_vehicleOut.txt"}
     assert "ratio" in left["LW1/x_quality_log.txt"]
-    assert "not at the time" in left["UAV/old_vehicleOut.txt"]  # longer, but no level goes with it
+    assert "outside the time" in left["UAV/old_vehicleOut.txt"]  # longer, but no level goes with it
     assert "flight: flight_2025-06-01_" in text
 
 
@@ -94,7 +94,7 @@ def test_a_radio_clock_in_utc_is_asked_about_and_compared(logs: Path) -> None:
     late, other = sorted(remark for remark in remarks if remark.startswith("left out: "))
     assert "LW2/USRP1_power_log.txt" in late
     assert "daylight saving was taken into account in one log only" in late
-    assert "later_power_log.txt: LW3/USRP1_power_log.txt has" in other
+    assert "later_power_log.txt: LW3/USRP1_power_log.txt already has" in other
     assert any("samples can be compared" in remark for remark in remarks)
     settings = parse_yaml(text, FlightFile)
     data = load_data(settings, logs)
@@ -151,7 +151,7 @@ def test_one_record_of_each_channel_and_rank(logs: Path) -> None:
     left = [remark for remark in remarks if remark.startswith("left out: ")]
     assert len(left) == 3
     assert any("the same bytes as LW1/USRP1_power_log.txt" in r or "the same bytes as LW1/copy" in r for r in left)
-    assert any("has USRP1 of that tower and time already" in r for r in left)
+    assert any("already has USRP1 of that tower at that time" in r for r in left)
     assert any("z_vehicleOut.txt: the track comes from other telemetry" in r for r in left)
     (logs / "flight.yaml").write_text(text)
     data = load_data(load_flight(logs / "flight.yaml"), logs)
@@ -164,7 +164,7 @@ def test_of_two_logs_of_a_channel_the_fuller_one_is_taken(logs: Path) -> None:
     part.write_text("".join(full.read_text().splitlines(keepends=True)[100:200]))
     text, remarks = draft(ingest(logs, options=OPTIONS), logs, DraftOptions(timezone=ZONE))
     assert "LW1/USRP1_power_log.txt, reader" in text
-    left = "left out: LW1/USRP1_a_power_log.txt: LW1/USRP1_power_log.txt has USRP1 of that tower and time already"
+    left = "left out: LW1/USRP1_a_power_log.txt: LW1/USRP1_power_log.txt already has USRP1 of that tower at that time"
     assert left in remarks
     assert text.index("path: LW1/") < text.index("path: LW2/")
 

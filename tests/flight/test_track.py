@@ -314,7 +314,7 @@ def test_sparse_fixes_are_joined_where_they_are_slow_or_fly_straight(speed_mps: 
     track = Track(telemetry(seconds, east, 0, 40), FRAME)
     pose = track.pose_at(at(seconds[:-1] + 7.0))
     assert np.flatnonzero(~pose.valid).tolist() == lost
-    assert any("a fix every 14 s: positions between are interpolated" in t for t in track.account.warnings)
+    assert any("a fix every 14 s: positions in between are interpolated" in t for t in track.account.warnings)
     np.testing.assert_allclose(pose.position_m[:19, 0], speed_mps * (seconds[:19] + 7.0), atol=1e-3)
     said = "turns between fixes" in track.why_not(pose.where(pose.valid)), track.account.sparse_error_m[1] == 10.0
     assert said == (bool(lost), bool(lost))

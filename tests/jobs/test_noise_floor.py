@@ -73,4 +73,4 @@ def test_a_rank_link_without_a_noise_floor_is_named(tmp_path: Path, keys: str, n
     assert not any("link.rank" in line for line in load_data(load_flight(flight), tmp_path).warnings)  # 20 MHz
     flight.write_text(text.replace("rt:", f"  rank: {{carrier_hz: 3.4e9{keys}}}\nrt:", 1), encoding="utf-8")
     warnings = load_data(load_flight(flight), tmp_path).warnings
-    assert any("link.rank: no bandwidth_hz" in line and "-174 dBm" in line for line in warnings) == named
+    assert any("link.rank has no bandwidth_hz" in line and "-174 dBm" in line for line in warnings) == named

@@ -478,7 +478,7 @@ def test_a_rank_that_is_asked_for_slowly_is_not_stale_for_it():
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"east_m": None, "telemetry_age_s": 9.0}, "the telemetry log does not reach the present"),
+        ({"east_m": None, "telemetry_age_s": 9.0}, "the telemetry log is not up to date"),
         ({"east_m": 5.0, "telemetry_age_s": 0.1, "fix": 1.0}, "no 3-D fix"),
         ({"east_m": None, "fix": None}, "has no lines yet"),
     ],

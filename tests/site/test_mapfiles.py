@@ -353,7 +353,7 @@ def test_a_building_drawn_above_the_ground_has_its_signed_height(tmp_path: Path)
         (b'{"elements": [], "remark": "runtime error: out of memory"}', "out of memory"),
         (b'{"type":"Point","crs":"urn:ogc:def:crs:EPSG::3857","coordinates":[0,0]}', "EPSG::3857.*ogr2ogr"),
         (b"PK\x03\x04xxxx", "not a KMZ archive"),
-        (b"[" * 100_000, "nested too deep"),
+        (b"[" * 100_000, "nested too deeply"),
     ],
 )
 def test_other_files_are_named_for_what_they_are(tmp_path: Path, content: bytes, words: str) -> None:

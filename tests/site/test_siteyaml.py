@@ -177,7 +177,7 @@ SQUARE = "[[0, 0], [10, 0], [10, 10], [0, 10]]"
         ("  U: {latitude_deg: 35.7275, longitude_deg: 78.696}", 5, "west is negative"),
         ("  U: {latitude_deg: 35.9, longitude_deg: -78.696}", 5, "a digit is wrong"),
         ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna_height_m: 3300}", 5, "feet or centimetres"),
-        ("  joint: {latitude_deg: 35.7275, longitude_deg: -78.696}", 5, "maps call the nearest tower so"),
+        ("  joint: {latitude_deg: 35.7275, longitude_deg: -78.696}", 5, "maps reserve this name"),
         ("  T 1: {latitude_deg: 35.7275, longitude_deg: -78.696}\n  T_1: {latitude_deg: 35.7275, longitude_deg: -78.696}", 6, "both are 'T_1' in the names of layers"),
         ("area_m: [10, -10, 0, 5]", 5, "east_min, east_max"),
         ("tower_ground: dem", 5, "the key 'dem'"),

@@ -60,7 +60,7 @@ def tap(
         Option(help=f"Also serve a page of the flight, protected by a token, at HOST:PORT [default: {WEB}]."),
     ] = None,
     flight: Annotated[Path | None, Option(help="flight.yaml for which rank and level are also predicted.")] = None,
-    telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,
+    telemetry: Annotated[Path | None, Option(help="Growing vehicleOut log with the poses for --flight.")] = None,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
     _needs_posix("tap")

@@ -730,7 +730,7 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
         entry["time_origin"] = context.options.time_origin
     elif origin is not None:
         entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
-        comment = _also(comment, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
+        comment = _also(comment, f"time_origin from two tracks {origin.distance_m:.1f} m apart: the same flight?")
     # a report needs the mapping of columns to read the file
     entry |= context.options.mapping if file.result.reader == "generic_csv" else {}
     entry |= {"skip": sorted(refused)} if refused else {}
@@ -877,14 +877,14 @@ def _refused(
         if span is None:
             why: str | None = "no samples"
         elif stream.name in leading:
-            why = f"it has the receiver and cell of {leading[stream.name]}, which is compared"
+            why = f"it is from the same receiver and cell as {leading[stream.name]}, which is compared"
         else:
             why = _reason(stream, span, context, dated=dated)
         if not why and stream.kind != "telemetry":
             source = next((at for k, when, at in taken if k == key and when and span and meet(span, when)), None)
             if source is not None:
                 where = "another stream of the log" if source == shown else source
-                why = f"{where} has {key[1]} of that tower and time already"
+                why = f"{where} already has {key[1]} of that tower at that time"
             else:
                 taken.append((key, span, shown))
         if why:
@@ -955,7 +955,7 @@ _RATIO = "a signal-to-noise ratio, not a level"
 def _late(span: Span, flown: Span, timezone: str | None = None) -> str:
     trap = clock_trap(span, flown, timezone)
     shown = [" .. ".join(str(t.astype("datetime64[s]")).replace("T", " ") for t in s) for s in (span, flown)]
-    return f"{shown[0]} is not at the time of the telemetry, {shown[1]} (UTC)" + (f": {trap.advice()}" if trap else "")
+    return f"{shown[0]} is outside the time of the telemetry, {shown[1]} (UTC)" + (f": {trap.advice()}" if trap else "")
 
 
 def _missing(stream: Stream) -> int:

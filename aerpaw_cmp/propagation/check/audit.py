@@ -297,7 +297,7 @@ class _OneLink:
         under = _decibel(power) + link.transmit_power_dbm < link.noise_floor_dbm
         error = float(np.abs(ours - h).max()) / size
         if not error <= _EXACT_TOLERANCE:
-            failures.append(f"{self.name}: H differs by {error:.2g} of its size")
+            failures.append(f"{self.name}: the relative error of H is {error:.2g}")
         worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
         for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
             # the coherent level is computed from H, and the other level from the path powers
@@ -516,7 +516,7 @@ def _paths_against_sionna(
             worst = int(np.argmax(np.where(bad, error, -1.0)))
             faces = ", ".join(replay.faces.label[face] for face in ours.faces[worst] if face >= 0)
             failures.append(
-                f"{counted(int(bad.sum()), 'path')} unlike Sionna's own by up to {error[worst]:.3g} {unit}: worst "
+                f"{counted(int(bad.sum()), 'path')} differing from Sionna by up to {error[worst]:.3g} {unit}: worst "
                 f"{replay.towers[ours.tower[worst]]}, pose {chosen[ours.pose[worst]]}, {faces or 'line of sight'}"
             )
     if rss > _LINK_TOLERANCE_DB:

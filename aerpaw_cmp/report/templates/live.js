@@ -6,12 +6,12 @@
   const scene = JSON.parse(at("scene").textContent), mapped = Boolean(scene.site);
   const MEASURED = ["t", "rank", "rsrp", "sinr"];
   const PREDICTED = ["t", "rank", "predicted", "low", "high", "rsrp", "level", "levelLow", "levelHigh", "east", "north", "up"];
-  const MOST = 150000; // rows kept of each table: beyond, the older half goes
-  const SILENT_MS = 10000; // the tap says something every second: after so long without, the connection is made anew
+  const MOST = 150000; // largest number of stored rows per table; above it, the older half is dropped
+  const SILENT_MS = 10000; // the tap sends something every second; after this time without data, the page reconnects
   const state = { modems: [], alarms: new Map(), epoch: "", page: "", ended: null, chosen: 0, pose: null, drawn: 0, delay: NaN, now: NaN, clock: null, start: 0, beeps: 0, received: 0 };
   const view = { zoom: 1, east: 0, north: 0 };
 
-  // --- what comes ---------------------------------------------------------------------------------------------------
+  // --- received data ---------------------------------------------------------------------------------------------------
 
   const table = names => ({ names, count: 0, columns: Object.fromEntries(names.map(name => [name, []])) });
   const last = list => list.length ? list[list.length - 1] : NaN;
@@ -31,7 +31,7 @@
 
   function receive(text, id) {
     const message = JSON.parse(text);
-    if (state.page && message.page !== state.page) { location.reload(); return; } // the tap was started anew with another flight
+    if (state.page && message.page !== state.page) { location.reload(); return; } // the tap was restarted with another flight
     if (message.epoch !== state.epoch) {
       for (const modem of state.modems) for (const rows of [modem.rows, modem.predictions]) {
         rows.count = 0;
@@ -58,7 +58,7 @@
 
   // --- the connection -----------------------------------------------------------------------------------------------
 
-  history.replaceState(null, "", location.pathname); // the token does its work once: the cookie is there, and nobody reads it in the bar
+  history.replaceState(null, "", location.pathname); // the token is used once: the cookie replaces it, so remove it from the address bar
   let source = null, opening = 0;
   function connect() {
     if (source) source.close();
@@ -100,7 +100,7 @@
   }
   at("theme").addEventListener("click", () => setTheme(document.documentElement.dataset.theme === "dark" ? "sun" : "dark"));
 
-  // --- words --------------------------------------------------------------------------------------------------------
+  // --- texts --------------------------------------------------------------------------------------------------------
 
   const clock = (ms, digits = 8) => Number.isFinite(ms) ? new Date(ms).toISOString().slice(11, 11 + digits) : "–";
   const integer = v => Number.isFinite(v) ? String(Math.round(v)) : "–";
@@ -205,13 +205,13 @@
     return wide ? [Math.max(first, state.now - wide), Math.max(state.now, first + 5000)] : [first, Math.max(state.now, first + 5000)];
   }
 
-  const scales = new Map(); // of each chart, for the pointer
+  const scales = new Map(); // the x axis of each chart, for the pointer
 
   function chart(id, parts, y) {
     const canvas = at(id);
     if (!canvas || !canvas.clientWidth) return;
     const [low, high] = range(), [pen, w, h] = common.frame(canvas);
-    const end = high - 0.04 * (high - low), marks = common.clockTicks(low / 1000, end / 1000, Math.max(2, w / 110), 0).map(t => t * 1000); // no label is cut at the edge
+    const end = high - 0.04 * (high - low), marks = common.clockTicks(low / 1000, end / 1000, Math.max(2, w / 110), 0).map(t => t * 1000); // keep labels inside the edge
     const g = common.axes(pen, w, h + 16, { low, high, label: "", marks, words: t => clock(t) }, y, 52);
     scales.set(id, { g, low, high, again: () => chart(id, parts, y) });
     pen.save(); pen.beginPath(); pen.rect(g.left, g.top - 4, g.right - g.left, g.bottom - g.top + 8); pen.clip();
@@ -226,7 +226,7 @@
     if (fixed) pen.fillStyle = colour;
     for (let i = a; i < b; i++) if (Number.isFinite(values[i])) { if (!fixed) pen.fillStyle = colour(i); pen.fillRect(g.X(time[i]) - size / 2, g.Y(values[i]) - size / 2, size, size); }
   };
-  function runs(time, values, low, high, job) { // stretches without a hole: nothing is drawn where nothing is known
+  function runs(time, values, low, high, job) { // segments without a gap: nothing is drawn in a gap
     const [a, b] = within(time, low, high);
     let run = [];
     for (let i = a; i <= b; i++) {
@@ -280,7 +280,7 @@
     if (!canvas) continue;
     const saves = Object.assign(document.createElement("p"), { className: "saves" });
     saves.append(common.downloads(canvas, id.slice(6), () => listed("rows"), () => scales.get(id)?.again()));
-    canvas.previousElementSibling.before(saves); // floats beside the heading: no line is lost in the field
+    canvas.previousElementSibling.before(saves); // shown next to the heading, so that it takes no line on a small screen
     canvas.addEventListener("pointermove", e => {
       const s = scales.get(id);
       if (!s) return;
@@ -436,7 +436,7 @@
     common.unpack(scene).then(arrays => { layers = { rank: arrays[scene.rank], level: common.values(arrays[scene.level], 0.1) }; later(draw); });
   }
 
-  // --- all of it ----------------------------------------------------------------------------------------------------
+  // --- the complete page ----------------------------------------------------------------------------------------------------
 
   function draw() {
     drawState(); drawCards(); drawAlarms(); drawCharts(); drawPose(); drawMap();

@@ -240,7 +240,7 @@
       pen.fillStyle = css("--soft"); pen.textAlign = "left"; pen.fillText("Drag over the map: profile along the line.", 10, 24); pen.fillText("Point at a cell: its values over height.", 10, 44);
       return;
     }
-    const g = axes(pen, w, h, { low: points[0][0], high: points[points.length - 1][0], label: along.length ? "Distance along the line [m]" : "Height of the cell pointed at [m]" }, classAxis(points.map(p => p[1])));
+    const g = axes(pen, w, h, { low: points[0][0], high: points[points.length - 1][0], label: along.length ? "Distance along the line [m]" : "Height at the selected cell [m]" }, classAxis(points.map(p => p[1])));
     pen.strokeStyle = css("--accent"); pen.fillStyle = css("--accent"); pen.lineWidth = 1.6; pen.beginPath();
     let on = false;
     for (const [x, v] of points) { if (!Number.isFinite(v)) { on = false; continue; } if (on) pen.lineTo(g.X(x), g.Y(v)); else pen.moveTo(g.X(x), g.Y(v)); on = true; }

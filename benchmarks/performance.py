@@ -246,7 +246,7 @@ def country(history: list[dict[str, Any]]) -> list[str]:
         f"Villages on 32 x 32 km: 3 towers, 3 000 buildings, one height of 3 m, one reflection, 4 x 4 elements, "
         f"{result['workers']} workers, tiles of {result['cells']} x {result['cells']} positions ({when}). Wall-clock "
         "seconds include imports, store and page. `python benchmarks/country.py --receivers 1e7` measures it.", "",
-        "| receivers | tiles | wall s | processor s | receivers a second | largest worker MiB | first process MiB "
+        "| receivers | tiles | wall s | processor s | receivers per second | largest worker MiB | first process MiB "
         "| store MiB | files |",
         "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
         *("| " + " | ".join(number(row[key]) for key in COUNTRY) + " |" for row in result["rows"]),
@@ -289,7 +289,7 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
         f"| {row['ratio_marginal']:.2f} |",
         "", f"27 fields at {number(counts[0])} targets: {row[f'ratio_total_{counts[0]}_27_fields']:.0f} "
         "times faster than 27 runs of PyKrige.", "",
-        "From 2026-11-29 on, semivariances are computed for each target, also if it shares samples with its "
+        "From 2026-11-29 on, semivariances are computed for each target, even if it shares samples with its "
         "neighbours. On a machine with other work, 100 000 scattered targets then take 0.83 s instead of 0.48 s. The "
         "time of maps on a grid does not change.", "",
     ]  # fmt: skip

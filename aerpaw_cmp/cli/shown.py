@@ -149,7 +149,7 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
     # without a terminal, rich uses 80 columns
     console = Console(width=width if width or sys.stdout.isatty() else 160)
     needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
-    # 3 is a border and a blank on each side of a cell
+    # 3 is the width of a border and a space on each side of a cell
     roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
     if sum(min(need, _FIXED) + 3 for need in needs) + 1 > console.width:
         _paragraphs(columns, rows, title, console.width)

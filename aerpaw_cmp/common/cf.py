@@ -34,7 +34,7 @@ def wgs84() -> dict[str, Any]:
 
 def flags(meanings: Sequence[str], dtype: type[np.integer[Any]] = np.int8, first: int = 0) -> dict[str, Any]:
     """Return the attributes of integer codes ``first``, ``first`` + 1, ... with these meanings."""
-    # replace characters that CF does not allow in a meaning, such as the blanks that separate meanings
+    # replace characters that CF does not allow in a meaning, such as the spaces that separate meanings
     words = [re.sub(r"[^A-Za-z0-9_.+@-]", "_", text) or "_" for text in meanings]
     return {"flag_values": np.arange(first, first + len(words), dtype=dtype), "flag_meanings": " ".join(words)}
 

@@ -122,7 +122,7 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
         cells = [str(place.text or "").split() for place in named(shape, "coord")]
     else:
         texts = " ".join(str(places.text or "") for places in named(shape, "coordinates"))
-        # 'longitude, latitude' with a blank is common and can mean nothing else
+        # 'longitude, latitude' with a space is common and can mean nothing else
         cells = [place.split(",") for place in re.sub(r"\s*,\s*", ",", texts).split()]
     try:
         places = [tuple(float(cell) for cell in place) for place in cells]

@@ -465,7 +465,7 @@ def _mounted_below(folder: Path) -> list[Path]:
         lines = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     except OSError:
         return []
-    # blanks and similar characters are octal numbers in this list
+    # spaces and similar characters are octal numbers in this list
     points = (re.sub(r"\\(\d{3})", lambda code: chr(int(code[1], 8)), line.split(" ")[4]) for line in lines)
     return [Path(point) for point in points if folder in Path(point).parents]
 

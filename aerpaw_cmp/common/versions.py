@@ -42,7 +42,7 @@ def commit() -> str:
     # --long always adds the number of commits after the tag, so that the output has one form
     ask = ["git", "-C", str(package.parent), "describe", "--tags", "--always", "--long", "--abbrev=7"]
     try:
-        # do not use a shell, because the path of a checkout may contain blanks and quotes
+        # do not use a shell, because the path of a checkout may contain spaces and quotes
         told = subprocess.run(
             [*ask, "--dirty=.dirty", "--match", release], capture_output=True, text=True, check=True, timeout=10
         )

@@ -105,7 +105,7 @@ _DATE = re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)")
 
 
 def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
-    """Return the question about a log whose name has another flight number or date than the track, otherwise empty."""
+    """Return a question if a log's name has another flight number or date than the track, otherwise an empty text."""
     names = ["/".join(Path(item.path).parts[-2:]) for item in (file, track)]
     first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
     if first and second and not first & second:

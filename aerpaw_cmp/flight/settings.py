@@ -345,7 +345,7 @@ class PlanSettings(StrictModel):
 class FlightSettings(StrictModel):
     """The name and kind of the flight."""
 
-    # the name of the report's folder must not have blanks, separators or a leading dot
+    # the name of the report's folder must not have spaces, separators or a leading dot
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     title: str | None = None
     synthetic: bool = False

@@ -43,7 +43,7 @@ class Query:
     text : str
         The command, without its end.
     prefixes : tuple of str, or None
-        Prefixes of its information lines, without blanks. None: any line.
+        Prefixes of its information lines, without spaces. None: any line.
     decode : callable
         ``decode(lines, flags) -> values``; appends to ``flags``.
     """
@@ -91,7 +91,7 @@ def _split_fields(payload: str) -> list[str | None]:
 
 
 def _payload_of(line: str, prefix: str) -> str | None:
-    """Return the text after ``prefix``, without colon and blanks. None if the line starts otherwise."""
+    """Return the text after ``prefix``, without colon and spaces. None if the line starts otherwise."""
     if not line.startswith(prefix):
         return None
     return line[len(prefix) :].lstrip(": ")
@@ -611,7 +611,7 @@ class Framer:
         command : str
             Command as written to the port, without the line end.
         prefixes : tuple of str, or None
-            Prefixes of its information lines, without blanks. ``()``: it has none. None: any line.
+            Prefixes of its information lines, without spaces. ``()``: it has none. None: any line.
         """
         self._open = _Open(command, prefixes, [], [])
 

@@ -123,7 +123,7 @@ def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArra
 
 
 def _texts(rows: Sequence[Iterable[str]]) -> AnyArray:
-    """Return rows of characters as texts without trailing blanks."""
+    """Return rows of characters as texts without trailing spaces."""
     return np.array(["".join(row).rstrip("\0").rstrip() for row in rows] or [""], dtype=np.str_)[: len(rows)]
 
 
@@ -226,7 +226,7 @@ def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) ->
 
 
 def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:
-    """Return the rows of a character matrix as text, without trailing blanks."""
+    """Return the rows of a character matrix as text, without trailing spaces."""
     encoding = _ENCODINGS.get(values.kind)
     if len(shape) > 2 and math.prod(shape) == shape[0] * shape[-1]:
         shape = shape[0], shape[-1]  # SciPy writes a column of texts with an additional dimension

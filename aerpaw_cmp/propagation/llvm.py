@@ -172,7 +172,7 @@ def _system_paths() -> list[Path]:
 
 
 class SionnaMissingError(UsageError):
-    """The error that Sionna RT cannot be loaded. Only the audit and ``rt.engine: sionna`` need it."""
+    """The error if Sionna RT cannot be loaded. Only the audit and ``rt.engine: sionna`` need it."""
 
 
 def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:

@@ -357,7 +357,7 @@ def _check_last_line(text: str, rows: _Rows) -> None:
 
 
 def _check_header(line: str, number: int) -> None:
-    # remove blanks and points, in which the headers of files differ
+    # remove spaces and points, in which the headers of files differ
     columns = [re.sub(r"[\s.]", "", cell.lower()) for cell in line.split("\t")]
     if len(columns) != 7 or not all(cell.startswith(column) for cell, column in zip(columns, _COLUMNS, strict=True)):
         cause = "the columns are not separated by tabs" if len(columns) == 1 else None

@@ -650,7 +650,7 @@ class Named(StrictModel):
 
 
 class UnknownName(UsageError):  # noqa: N818  # a case of its base, which is the error
-    """The error that no learned model has a given name."""
+    """The error for a name that no learned model has."""
 
 
 def find_named(name: str, folder: Path, end: str = "") -> Named:

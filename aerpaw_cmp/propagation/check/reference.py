@@ -513,7 +513,7 @@ class Reference:
         Returns
         -------
         complex
-            Coefficient whose squared magnitude is received over sent power. 0 if the path does not exist.
+            Coefficient whose squared magnitude is the ratio of received to sent power. 0 if the path does not exist.
         """
         tower, uav = self.link.towers[self.tower], self.link.uav
         start = _plus(self.source, _times(tower.mount, tower.positions_m[tx]))

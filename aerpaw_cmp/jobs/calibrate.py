@@ -542,7 +542,7 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
         if series.channel.lower() != SNR or any(s.channel.lower() not in RATIOS for s in data.rss):
             return None, [f"{data.settings.flight.name}: {series.channel} is a ratio, not a level: ignored"]
         remarks.append(
-            f"{data.settings.flight.name}: {series.tower} {SNR} is used as a level; the noise is taken as constant"
+            f"{data.settings.flight.name}: {series.tower} {SNR} is used as a level; the noise is assumed to be constant"
         )
     observed, guessed, lost = observed_series(data, series)
     if not np.isfinite(observed.samples.residual_db).any():

@@ -230,7 +230,7 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> A
     place, known = data.tower_at(towers[0], time)
     track = data.poses_at(time).where(known)
     if not track.valid.any():
-        raise UsageError("no time of the flight has a pose", expected="positions", cause=data.track.why_not(track))
+        raise UsageError("the flight has no known position", expected="positions", cause=data.track.why_not(track))
     left = int((~track.valid).sum())
     return Along(
         name=data.settings.flight.name,

@@ -578,9 +578,9 @@ def _ranking(data: CampaignData) -> Table:
              r.difference_ci95_db or "", r.verdict)
             for place, r in enumerate(data.season.ranking, 1)
         ],
-        notes=["The difference from the best setting is computed on the same flights, towers and channels, and its "
-               "95 % interval over the flights. The best setting was selected on these flights, so expect a larger "
-               "error on other flights."],
+        notes=["The difference from the best setting is computed on the same flights, towers and channels. Its 95 % "
+               "interval is computed over the flights. The best setting was selected on these flights, so expect a "
+               "larger error on other flights."],
     )  # fmt: skip
 
 

@@ -135,8 +135,8 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
     return [part for place in places for part in ([place] if len(place) <= 3 else _in_threes(place))]
 
 
-# The longitudes of an area differ by less than this [deg], and so do its latitudes. A longitude and a latitude differ
-# by more.
+# Within an area, longitudes differ by less than this [deg], and so do latitudes. The difference between a longitude and
+# a latitude is larger.
 _AREA_DEG = 5.0
 
 

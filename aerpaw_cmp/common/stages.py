@@ -106,7 +106,7 @@ class Stages:
     progress : Progress
         Receives the name of each stage when it begins.
     seconds : dict of str to float
-        Time of each stage [s]. Stages with the same name are added.
+        Time of each stage [s]. The times of stages with the same name are added.
     plan : Plan, optional
         Plan of a dry run.
 

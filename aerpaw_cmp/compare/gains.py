@@ -435,7 +435,7 @@ class GainFit:
         return dataclasses.replace(samples, campaign=first.campaign, airframe=first.airframe)
 
     def _rows_of(self, antenna: str) -> list[LinkSamples]:
-        """Return the rows of an antenna."""
+        """Return the fitted links with an antenna."""
         rows = [s for s in self.rows if s.antenna == antenna]
         if not rows:
             raise UsageError(

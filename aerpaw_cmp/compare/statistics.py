@@ -292,7 +292,7 @@ def weights(kind: Kind) -> FloatArray:
 
 @cache
 def stretches(kind: Kind) -> FloatArray:
-    """Return the widening of the draws (2, m): per weighted share of each correlation, and per unweighted share."""
+    """Return factors (2, m) that widen the draws: for the weighted and the unweighted share of each correlation."""
     if kind in ("ratio", "influence"):  # for these kinds, the weights are enough to limit false verdicts to 5 %
         return np.repeat([[1.0], [0.0]], len(weights(kind)), axis=1)
     return 0.01 * _table(f"{kind} stretch").reshape(2, -1)
@@ -835,7 +835,7 @@ class PairedDifference:
         return f"{self.verdict} than {other_model} by {size}"
 
 
-# Smaller differences [dB] between the errors of two models are rounding.
+# Smaller differences [dB] between the errors of two models are rounding errors.
 _ROUNDING_DB = 1e-9
 
 
@@ -970,7 +970,7 @@ def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | 
     order = sorted(range(len(pairs)), key=lambda i: pairs[i].p_value)
     names = measured or range(len(pairs))
     out, tried = list(pairs), {names[i] for i in order if pairs[i].verdict != "no interval"}
-    several = len(tried) > 1  # one channel has the verdict of its interval, like the flight
+    several = len(tried) > 1  # a single channel keeps the verdict of its interval
     for place, i in enumerate(order):
         if several and pairs[i].p_value * max(len(tried), 1) > _FAMILY:
             for rest in order[place:]:
@@ -1222,7 +1222,7 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
 def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> _Places:
     """Return the positions of some samples, the same object for links that were sampled together."""
     columns = (good, flown.position_m, *([] if flown.heading_deg is None else [flown.heading_deg]))
-    # by content, because links that were sampled together have equal positions in different arrays
+    # compare contents, because links that were sampled together have equal positions in different arrays
     key = hashlib.sha256(b"".join(column.tobytes() for column in columns)).digest()
     return places.setdefault(key, _Places(flown.position_m, flown.heading_deg, good))
 

@@ -727,7 +727,7 @@ class _Segment:
         inflation = self.inflation()
         (before, weight), (after, weight_after) = self.level(), _mean(nights)
         # The level before the step is also a mean of consecutive nights. One or two nights count as independent,
-        # because they do not show a correlation, and because the end of rain must be found.
+        # because they are too few to show a correlation, and because the end of rain must be found.
         level = (inflation if len(self.values) > 2 else 1.0) / weight
         share = (inflation if len(nights) > 1 else 1.0) / weight_after + level
         error = float(np.sqrt(max(square, 1e-12) / freedom * share))

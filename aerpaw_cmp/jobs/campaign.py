@@ -134,7 +134,7 @@ class _Logs:
 
 
 def flight_data(task: Task) -> FlightData:
-    """Read the flight of a task. It raises the errors of :mod:`aerpaw_cmp.flight.data`."""
+    """Read the flight of a task. The errors are those of :mod:`aerpaw_cmp.flight.data`."""
     settings = _settings(task)
     folder, root = task.path.parent, task.logs_root
     text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])

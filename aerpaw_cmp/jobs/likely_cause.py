@@ -158,8 +158,8 @@ def is_simulated(telemetry: Stream) -> bool:
 
 _RECEIVER = {"fix": 6, "satellites": 10}
 # Smallest numbers of rows for the tests of constant columns and of voltages, and share of the rows that have one of the
-# three most frequent voltages. For the simulator's battery, the share was 97 % on one flight. For a real battery, a
-# single voltage has at most 5 %.
+# three most frequent voltages. For the simulator's battery, the share was 97 % on one flight. On a real battery, no
+# single voltage has more than 5 % of the rows.
 _FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
 
 SIMULATED = Cause(

@@ -30,7 +30,7 @@ def mapping(pairs: list[str]) -> dict[str, Any]:
     Raises
     ------
     UsageError
-        If a pair is malformed, or two pairs name one quantity.
+        If a pair is malformed, or if two pairs name the same quantity.
     """
     columns: dict[str, str] = {}
     for pair in pairs:

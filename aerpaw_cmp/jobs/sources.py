@@ -262,7 +262,7 @@ def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
     begin, end = np.clip(time - 1.0, time[0], None), np.clip(time + 1.0, None, time[-1])
     moved = interpolated(end, time, position_m) - interpolated(begin, time, position_m)
     up = np.radians(LEAN_DEG_PER_MPS) * moved / np.maximum(end - begin, 1e-9)[:, None]
-    # use the angle as the tangent of the lean: then a jump of the positions cannot turn the aircraft over
+    # use this number as the tangent of the lean, so that a jump of the positions cannot turn the aircraft over
     up[:, 2] = 1.0
     return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
 
@@ -397,7 +397,7 @@ def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
     Raises
     ------
     UsageError, InputError
-        If a file is wrong, as for any settings file.
+        If a file is not a valid settings file.
     """
     out = []
     for path in paths:

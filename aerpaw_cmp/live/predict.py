@@ -1,4 +1,4 @@
-"""The rank and level that the replay predicts for the present pose, computed in parallel to the polling.
+"""The rank and level that the replay predicts for the present pose, computed in parallel with the polling.
 
 The tap passes a time and gets records back. The caller determines how a time becomes a pose and a pose a rank.
 :class:`~aerpaw_cmp.live.predict.TelemetryFollower` returns the pose from a telemetry log that is still being written.

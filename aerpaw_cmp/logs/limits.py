@@ -219,7 +219,7 @@ def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
 
 
 def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArray, float, int]:
-    """Return masks (n,) of rows off the track and of rows at rest at an end, and speed and row of the first.
+    """Return masks (n,) of rows off the track and of those at rest at an end, and speed and row of the first jump.
 
     Rows between two fast steps form a run. The longest run that moves is the track. A run that the track cannot reach
     in time is off the track if it is short, or if it does not move and the log begins or ends with it. Any other run

@@ -297,7 +297,7 @@ ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
 
 class Count(NamedTuple):
-    """A unit of clocks: its name, nanoseconds, pattern in column names, and the smallest count that is an epoch."""
+    """A unit of time: its name, nanoseconds, pattern in column names, and the smallest count that is an epoch."""
 
     name: str
     ns: float
@@ -649,7 +649,7 @@ def frame(
     content: dict[str, Any] = {
         "time": array(time, dtype="datetime64[ns]"),
         "line": array(line, dtype=np.int64),
-        # object, not pandas' string type: no scan of the column, the same on every pandas
+        # use objects, not pandas' string type: they need no scan of the column and are the same in every pandas version
         "flag": pd.Series(array(flag, dtype=object), dtype=object, copy=False),
     }
     for name in COLUMNS[kind]:

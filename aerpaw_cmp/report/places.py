@@ -110,7 +110,7 @@ def payload(
 
 
 def _scale(group: str, layer: str) -> tuple[str, str]:
-    """Return the key of a colour scale. A quantity has one scale for all heights, and before and after a flight."""
+    """Return the key of a colour scale. It is the same at all heights, and before and after a flight."""
     return group.partition(", ")[0], layer.partition(" ")[0]
 
 

@@ -506,7 +506,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
             memory, _, damage = mended_index(folder)
             if damage is not None:
                 write_whole(damaged_copy(folder), (folder / _INDEX).read_bytes())
-            # files with a digest in an entry are ours, and so are an edited table and tables of a killed calibration
+            # replace only our files: those with a digest in an entry, edited tables, and tables of a killed calibration
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:
                 place = inside(folder, file, folder / _INDEX, plain=True)

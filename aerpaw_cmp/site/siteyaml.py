@@ -629,7 +629,7 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
 
 
 def _check_name(name: str, others: Iterable[str]) -> None:
-    """Refuse a name that a map could not distinguish in its files from the nearest tower or from another tower."""
+    """Refuse a name that a map reserves, or that its files could not distinguish from another tower's."""
     in_files = re.sub(r"\W", "_", name)
     if name == NEAREST:
         raise UsageError(f"a tower named '{name}'", expected="another name", cause="maps reserve this name")

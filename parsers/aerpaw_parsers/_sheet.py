@@ -514,7 +514,7 @@ _MOST_EQUAL = 0.3
 # A comment about units or the clock, which belongs to all columns.
 _UNITS_ABOVE = re.compile(r"(?i)\W*[#%;].*\b(feet|ft|inch|miles|knots|dbuv|dbw|mw|utc ?[+-]|offset|local time)")
 _YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
-# Names contain a letter. A column with more texts than this counts something.
+# Names contain a letter. A column with more different texts or numbers than this does not name cells or devices.
 _LETTER, _MOST_SOURCES, _MOST_NUMBERS = re.compile(r"[^\W\d_]"), 50, 8
 # Largest number of column names in one sentence.
 _MOST_NAMED = 20

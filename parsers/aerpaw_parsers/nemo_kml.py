@@ -79,7 +79,7 @@ def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray
     if not len(time_ms):
         return False
     speed_mps = typical_speed_mps(time_ms / 1e3, rough_m(latitude, longitude, (latitude[0], longitude[0])))
-    # if the phone is still too fast in seconds, the positions are wrong and not the unit
+    # if the phone is too fast even with times in seconds, the positions are wrong, not the unit
     return FASTEST_MPS < speed_mps <= 1e3 * FASTEST_MPS
 
 

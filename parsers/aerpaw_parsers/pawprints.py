@@ -30,7 +30,7 @@ _OF_TEXT = {
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether a file is the text of 2023, or the first line is an object with a phone's cells and times."""
+    """Check whether a file has the text format of 2023, or begins with a JSON object with a phone's cells and times."""
     if head.startswith((b"CELL_LOG_START,", b"GPS_LOG_START,")):
         return True
     first = head.lstrip(b"\xef\xbb\xbf[ \r\n").split(b"\n", 1)[0]

@@ -813,7 +813,7 @@ def _named_odds(data: FlightData, series: RssSeries, item: LearnedLink, receiver
 
 
 def _unit_odds(series: RssSeries, item: LearnedLink) -> float:
-    """Return the log odds that the unit of levels gives to a receiver. A level in dB can have any reference."""
+    """Return the log odds of a receiver from the unit of the levels. A level in dB can have any reference."""
     any_reference = series.unit == "dB" and series.channel.lower() not in RATIOS
     same = item.series.level is None or any_reference or item.level.unit == series.unit
     return 0.0 if same else _OTHER_UNIT

@@ -9,12 +9,12 @@ wide, and that of a crown is metres wide.
 
 A forest can also be modelled as a medium. Its loss combines the components through, over and around the canopy.
 
-A forest stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below. A
-segment of a path passes the stand by three components whose powers add up (ITU-R P.833-10 section 3.2): through the
-canopy, over the top, and around either side. The loss through the canopy depends on the length inside it. The way over
-the top has two knife edges, where the ray enters and leaves. Near the top, part of the Fresnel zone is in the canopy.
-There, the component through the canopy is that of a ray lowered until the zone is below the top, and the detours only
-add the missing power. The level therefore has no step where a ray leaves the canopy.
+A forest stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below.
+The field behind a stand has three components whose powers add up (ITU-R P.833-10 section 3.2): through the canopy, over
+the top, and around either side. The loss through the canopy depends on the length inside it. The way over the top has
+two knife edges, where the ray enters and leaves. Near the top, part of the Fresnel zone is in the canopy. There, the
+component through the canopy is that of a ray lowered until the zone is below the top, and the detours only add the
+missing power. The level therefore has no step where a ray leaves the canopy.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class P833:
     gamma_db_per_m : float
         Specific attenuation of short depths; 0.5 at 3.4 GHz (0.45 to 0.7 is plausible).
     maximum_db : float
-        A_m, which the loss approaches in depth; 38 dB at 3.4 GHz.
+        A_m, the limit of the loss for large depths; 38 dB at 3.4 GHz.
 
     Examples
     --------

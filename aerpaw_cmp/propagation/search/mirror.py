@@ -214,7 +214,7 @@ def _prisms(
     number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(rows)))
     # compare exactly, because roofs are created with this normal
     level = faces.normal[rows, 2] == 1.0
-    # the foot is that of the lowest wall of each building, without roofs
+    # the foot of a building is the lower end of its lowest wall, so roofs are ignored
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
     roofs = rows[level]
     footprints = _footprints(faces, roofs)

@@ -271,7 +271,7 @@ def _stationary(
 
 
 def _zone_m(along: FloatArray, at: FloatArray, excess_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Return the length around ``at`` where profiles (samples, points) lengthen a path by up to half a wavelength."""
+    """Return the length around ``at`` in which profiles (samples, points) lengthen a path by less than half a wave."""
     number, point = np.arange(len(along))[:, None], np.arange(len(at))
     half, width = wavelength_m / 2.0, np.zeros(len(at))
     beyond = ~(excess_m < half)

@@ -8,8 +8,8 @@ of tables:
 * Offset and RMSE of one channel: share of intervals that cover the mean of the process and the RMSE that such flights
   have on average, and median width relative to the interval for a known correlation. Coverage should be 92-97 %, and
   at least 92 % for errors over place. More flights are simulated while chance can explain a deviation (Wilson
-  interval), up to the last of the multiples :data:`STAGES`. The ratio of widths should be at most 1.5 from 20
-  correlation times per flight, and at most 3 for offsets over place.
+  interval), up to the last of the multiples :data:`STAGES`, or the one before it if only 97 % is near. The ratio of
+  widths should be at most 1.5 from 20 correlation times per flight, and at most 3 for offsets over place.
 * Two models over ten channels (4 dB): false verdicts on equal models, whose errors are random, partly common to all
   channels, or common with noise of each channel, or whose predictions differ along a route. A share that is too large
   is estimated again from more and other flights. Power if the difference is 0.3 dB, and that of a test that knows the
@@ -336,6 +336,7 @@ def level_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
         held = ((ends[..., 0] <= (0.0, truth)) & ((0.0, truth) <= ends[..., 1])).mean(axis=0)
         if not any(a < bound < b for a, b in (wilson(share, len(ends)) for share in held) for bound in bounds):
             break
+        bounds = ASKED[:1]  # the last stage only decides whether a coverage is too small
     alone = [[mean_interval(e), spread_interval(e)] for e in many[:flights]] if shadowing.length_m else ends
     alone = ((np.array(alone)[..., 0] <= (0.0, truth)) & ((0.0, truth) <= np.array(alone)[..., 1])).mean(axis=0)
     low, high = np.quantile(many.std(axis=1) / truth, [0.025, 0.975])
@@ -527,7 +528,7 @@ def main() -> None:
     global STAGES, SEED, KNOWN
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=200, help="simulated flights per cell")
-    parser.add_argument("--quick", action="store_true", help="some kinds, few flights: at most 3 minutes")
+    parser.add_argument("--quick", action="store_true", help="some kinds, few flights: about 2 minutes")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--figure", type=Path, help="draw the coverage of the kinds over place")

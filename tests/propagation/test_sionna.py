@@ -226,12 +226,6 @@ def test_batch_beyond_the_hash_table_is_refused(sionna, scenes):
         )
 
 
-def test_versions_name_the_device(sionna):
-    versions = sionna.engine_versions()
-    assert {"sionna-rt", "mitsuba", "drjit", "variant"} <= set(versions)
-    assert versions["variant"].startswith(("llvm", "cuda"))
-
-
 def test_cuda_and_llvm_agree(sionna, scenes, lone):
     import drjit as dr
     import mitsuba as mi

@@ -31,7 +31,6 @@ import numpy as np
 
 from ...common.errors import CheckError, UsageError
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
-from ...common.versions import version
 from ...site.materials import material
 from ..geometry import Faces, Link, Links, PathSet, Surfaces, inside, path_lengths, triangles
 from ..llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
@@ -113,17 +112,6 @@ def free_memory() -> None:
     """Free the memory that Dr.Jit keeps for further searches, if it was loaded."""
     if "drjit" in sys.modules:
         sys.modules["drjit"].flush_malloc_cache()
-
-
-def engine_versions() -> dict[str, str]:
-    """Return versions of sionna-rt, mitsuba and drjit (from their metadata), the variant and the LLVM in use."""
-    versions = {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
-    versions["variant"] = load_variant()
-    import drjit as dr
-
-    if versions["variant"].startswith("llvm"):
-        versions["llvm"] = ".".join(str(part) for part in dr.detail.llvm_version())
-    return versions
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
@@ -138,12 +139,16 @@ def lonlat(point: Any, where: str) -> Position:
     return latitude, longitude
 
 
-def left_out(path: Path, what: str, error: Exception) -> str:
-    """Return the note about the element ``what`` of a map file, which cannot be used because of an error."""
-    why = "it is not valid" + (f": no {error}" if isinstance(error, KeyError) else "")
-    if isinstance(error, InputError):
-        why = error.found.removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")
-    return f"warning: {path.name}: {what} was left out: {why}"
+@contextmanager
+def noting_damage(notes: list[str], path: Path, what: str) -> Iterator[None]:
+    """Turn the error of a damaged element into a note that it is left out."""
+    try:
+        yield
+    except BROKEN_ELEMENT as error:
+        why = "it is not valid" + (f": no {error}" if isinstance(error, KeyError) else "")
+        if isinstance(error, InputError):
+            why = error.found.removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")
+        notes.append(f"warning: {path.name}: {what} was left out: {why}")
 
 
 Kind = Literal["building", "forest", "geofence"]
@@ -374,10 +379,8 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path) -> MapFile
     """
     result, data = MapFile(kind, OSM_CREDIT), _Data(path)
     for number, element in enumerate(elements, start=1):
-        try:
+        with noting_damage(result.notes, path, f"element {number}"):
             _sort(element, number, data)
-        except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(path, f"element {number}", error))
     for identity, tags in data.trees.items():
         result.trees.append(TreeLine(f"{path.name}: node {identity}", tags, (data.nodes[identity],)))
     result.ground += [(data.nodes[identity], height_m) for identity, height_m in data.ground.items()]
@@ -386,10 +389,8 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path) -> MapFile
     for identity, way in data.ways.items():
         # a way without tags is part of a relation, or not used
         if way.get("tags") and identity not in used_ways:
-            try:
+            with noting_damage(result.notes, path, f"way {identity}"):
                 _way_outline(identity, way, data, result, lines)
-            except BROKEN_ELEMENT as error:
-                result.notes.append(left_out(path, f"way {identity}", error))
     result.note_no_areas(path.name, lines)
     return result
 
@@ -486,14 +487,11 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str]) -> set[str]:
             kind = kinds.pop()
             tags = {**next(words for words in own.values() if kind_of(words) == kind), **tags}
         outline = _outline(tags, f"relation {identity}", data.path)
-        try:
+        with noting_damage(result.notes, data.path, f"relation {identity}"):
             _multipolygon(relation, data, outline)
-        except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(data.path, f"relation {identity}", error))
-            continue
-        if outline.parts:
-            used_ways |= {ref for ref, words in own.items() if kind_of(words) == kind}
-        result.outlines.append(outline)
+            if outline.parts:
+                used_ways |= {ref for ref, words in own.items() if kind_of(words) == kind}
+            result.outlines.append(outline)
     return used_ways
 
 
@@ -677,12 +675,9 @@ def _geojson(content: dict[str, Any], path: Path) -> MapFile:
     if not isinstance(features, list):
         raise InputError("a FeatureCollection without a list of features", expected="'features': [...]")
     for number, feature in enumerate(features, start=1):
-        part = MapFile("GeoJSON")
-        try:
+        with noting_damage(result.notes, path, f"feature {number}"):
+            part = MapFile("GeoJSON")
             _feature(feature, number, part, lines, path)
-        except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(path, f"feature {number}", error))
-        else:
             result.take(part)
     result.note_no_areas(path.name, lines)
     return result
@@ -805,7 +800,7 @@ def _kml(root: ElementTree.Element, path: Path) -> MapFile:
         identity = name or f"placemark {number}"
         parts = list(outermost(placemark, _PLACEMARK_PARTS)) if len(placemark) else []
         outline = Outline(identity, f"{path.name}: {identity}", kml.data_of(iter(parts)))
-        try:
+        with noting_damage(result.notes, path, f"placemark '{identity}'"):
             polygons = [part for part in parts if plain_tag(part.tag) == "Polygon"]
             _kml_height(polygons, outline)
             for polygon in polygons:
@@ -813,13 +808,10 @@ def _kml(root: ElementTree.Element, path: Path) -> MapFile:
                 outer = [_kml_ring(b, outline) for b in bounds if plain_tag(b.tag) == "outerBoundaryIs"]
                 holes = [_kml_ring(b, outline) for b in bounds if plain_tag(b.tag) == "innerBoundaryIs"]
                 outline.parts += [(ring, holes) for ring in outer]
-        except BROKEN_ELEMENT as error:
-            result.notes.append(left_out(path, f"placemark '{identity}'", error))
-            continue
-        if outline.parts:
-            result.outlines.append(outline)
-            continue
-        lines.update(tag for tag in (plain_tag(part.tag) for part in parts) if tag in _NO_AREAS)
+            if outline.parts:
+                result.outlines.append(outline)
+            else:
+                lines.update(tag for tag in (plain_tag(part.tag) for part in parts) if tag in _NO_AREAS)
     result.note_no_areas(path.name, lines)
     return result
 

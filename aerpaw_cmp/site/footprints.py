@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from ..common.errors import InputError, UsageError, about_file
+from ..common.errors import InputError, UsageError, about_file, one_line
 from ..common.geodesy import SiteFrame
 from ..common.grouping import lists_by_key
 from ..common.text import counted
@@ -842,16 +842,12 @@ def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
     return {"name": name, "polygon_m": ring(area.exterior), "holes_m": [ring(hole) for hole in area.interiors]}
 
 
-def _printable(text: str) -> str:
-    """Return a text without control characters, which YAML refuses even in comments."""
-    return "".join(character if character.isprintable() else "?" for character in text)
-
-
 def site_yaml(model: SiteModel, *, header: Sequence[str] = ()) -> str:
     """Return the text of a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads as the same site.
 
     ``header`` lines become comments at the top, such as the actions of an import.
     """
     content = model.model_dump(mode="json", exclude_defaults=True)
-    text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())
+    # YAML refuses control characters even in comments
+    text = "".join(f"# {one_line(line)}\n" for entry in header for line in str(entry).splitlines())
     return text + dump_yaml(content)

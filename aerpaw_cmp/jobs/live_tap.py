@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import shlex
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..common.errors import typed
 from ..common.text import counted
 from ..live.feed import Feed
 from ..live.ports import Stop, TapSettings, TapStatus, TapSummary
@@ -143,7 +143,7 @@ def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str
         f", {counted(lost, 'record')} lost" if lost else ""
     )
     text = f"The tap ended at {at} UTC ({summaries[0].reason}): {counts}. The log is in {folder}."
-    telemetry = "VEHICLEOUT_LOG" if twin is None else shlex.quote(str(twin.telemetry))
+    telemetry = "VEHICLEOUT_LOG" if twin is None else typed(twin.telemetry)
     zone = "ZONE" if twin is None else twin.settings.timezone
-    ingest = f"aerpaw-cmp ingest {shlex.quote(str(folder))} {telemetry} --timezone {zone} --draft flight.yaml"
+    ingest = f"aerpaw-cmp ingest {typed(folder)} {telemetry} --timezone {zone} --draft flight.yaml"
     return {"text": text, "commands": [ingest, "aerpaw-cmp report flight.yaml"]}

@@ -173,14 +173,10 @@ def parse_yaml(text: str, model: type[ModelT], path: str | Path | None = None) -
 
 def _checked(document: _Document, model: type[ModelT], path: str | Path | None) -> ModelT:
     if document.value is None:
-        raise UsageError(
-            "the file contains no settings", expected=_KEYS.format(_listed(_field_names(model)[:4])), path=path
-        )
+        raise UsageError("the file contains no settings", expected=_keys_of(model), path=path)
     if not isinstance(document.value, dict):
-        raise UsageError(
-            "the file is not a list of 'key: value' settings", expected=_KEYS.format(_listed(_field_names(model)[:4])),
-            cause="another kind of file", path=path, line=1,
-        )  # fmt: skip
+        found, cause = "the file is not a list of 'key: value' settings", "another kind of file"
+        raise UsageError(found, expected=_keys_of(model), cause=cause, path=path, line=1)
     try:
         return model.model_validate(document.value)
     except pydantic.ValidationError as error:
@@ -223,7 +219,8 @@ class _Document:
         return self.lines.get(known)
 
 
-_KEYS = "keys such as {}"
+def _keys_of(model: type[pydantic.BaseModel]) -> str:
+    return f"keys such as {_listed(_field_names(model)[:4])}"
 
 
 def _parse(text: str, path: str | Path | None) -> _Document:
@@ -365,9 +362,7 @@ def _explain(
 ) -> UsageError:
     if (kind := _kind(document.value)) and kind != _kind(_field_names(model)):
         # suggesting near names is not useful if all names are unknown
-        return UsageError(
-            f"these are the settings of a {kind}", expected=_KEYS.format(_listed(_field_names(model)[:4])), path=path
-        )
+        return UsageError(f"these are the settings of a {kind}", expected=_keys_of(model), path=path)
     findings: list[tuple[int | None, str, str | None]] = []
     for item in error.errors(include_url=False):
         problem, cause = _finding(item, model)

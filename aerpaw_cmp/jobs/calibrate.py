@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 from ..common.content import union
 from ..common.errors import InputError, UsageError
 from ..common.gaussian import determining
+from ..common.grouping import lists_by_key
 from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
 from ..common.yamlfile import StrictModel, load_yaml
@@ -59,12 +60,9 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
     if len(flights_of(able)) < 3:
         return {}
     pairs = _without_pairs(observed, recipe)
-    out = {}
-    for antenna in dict.fromkeys(o.samples.antenna for o in able):
-        lock = _learned([o for o in able if o.samples.antenna == antenna], fits, pairs)
-        if lock is not None:
-            out[antenna] = lock
-    return out
+    series = lists_by_key((o.samples.antenna, o) for o in able)
+    locks = {antenna: _learned(each, fits, pairs) for antenna, each in series.items()}
+    return {antenna: lock for antenna, lock in locks.items() if lock is not None}
 
 
 def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -> dict[str, LearnedHealth]:

@@ -70,15 +70,7 @@ def live_page(background: dict[str, Any] | None, title: str) -> tuple[bytes, str
         Text next to the heading.
     """
     style, code = script("live.css"), script("common.js", "live.js")
-    text = (
-        environment()
-        .get_template("live.html.jinja")
-        .render(
-            title=title,
-            mapped=background is not None,
-            style=Markup(style),
-            script=Markup(code),
-            scene=Markup(as_json(background or {})),
-        )
-    )
+    shown = {"title": title, "mapped": background is not None, "scene": Markup(as_json(background or {}))}
+    page = environment().get_template("live.html.jinja")
+    text = page.render(style=Markup(style), script=Markup(code), **shown)
     return text.encode(), _POLICY.format(script=digest(code), style=digest(style))

@@ -116,12 +116,8 @@ def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
     """Render a template with its scripts and a content policy that allows only these scripts."""
     code = script(*scripts) if scripts else ""
     policy = _CONTENT_POLICY.format(script=digest(code) if code else "'none'")
-    text: str = (
-        environment()
-        .get_template(f"{template}.html.jinja")
-        .render(script=Markup(code), content_policy=policy, **content)
-    )
-    return text
+    page = environment().get_template(f"{template}.html.jinja")
+    return str(page.render(script=Markup(code), content_policy=policy, **content))
 
 
 def as_json(content: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ The page is one file that contains its script and loads no other file.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -59,28 +59,17 @@ def plan(site: Site) -> Figure:
     return fig
 
 
-def _view_of(site: Site) -> dict[str, Any]:
-    """Return the site as plain lists for the page, rounded to 0.1 m."""
-    shown = scene(site, TREES_IN_PAGE)
-    walled = zip(drawn_buildings(site), shown["buildings"], strict=True)
-    return {
-        **shown,
+def viewer(site: Site) -> str:
+    """Return the page that shows the site in 3-D."""
+    content = scene(site, TREES_IN_PAGE)
+    walled = zip(drawn_buildings(site), content["buildings"], strict=True)
+    content |= {
         "buildings": [{"name": b.name, "height": b.height_m, "faces": faces} for b, faces in walled],
         "limits": listed(view_limits(site)),
         "fences": [listed(g.area.exterior.coords) for g in site.geofences],
     }
-
-
-def viewer(site: Site) -> str:
-    """Return the page that shows the site in 3-D."""
-    content = _view_of(site)
-    return rendered(
-        "site_view",
-        ("common.js", "site_view.js"),
-        site=site,
-        scene=embedded(content),
-        trees_shown=len(content["trees"]),
-    )
+    shown = {"site": site, "scene": embedded(content), "trees_shown": len(content["trees"])}
+    return rendered("site_view", ("common.js", "site_view.js"), **shown)
 
 
 def write_site_view(site: Site, folder: str | Path) -> list[Path]:

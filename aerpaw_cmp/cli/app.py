@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -27,6 +27,7 @@ from typer.core import TyperCommand
 from ..common.errors import UsageError
 from ..common.stages import NotRun
 from ..common.text import COMMANDS
+from ..jobs.options import DEFAULT, RunOptions
 from .shown import print_plan, say
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -46,12 +47,6 @@ Force = Annotated[
     bool, Option("--force", help="Also replace files that this tool did not write; inputs are never replaced.")
 ]
 LogsRoot = Annotated[Path | None, Option("--logs-root", help="Folder to which the paths of the logs are relative.")]
-
-
-Workers = Annotated[int, Option(min=1, help="Number of local workers that share the tasks.")]
-Scheduler = Annotated[
-    str | None, Option("--scheduler", "--cluster", help="Address of a Dask scheduler to use instead of local workers.")
-]
 Flights = Annotated[
     list[Path] | None,
     Option(
@@ -64,13 +59,30 @@ Figures = Annotated[
     Literal["none", "svg", "png", "pdf", "all"],
     Option(help="Format of figures as separate files: none, one format, or all formats."),
 ]
-DryRun = Annotated[bool, Option("--dry-run", help="Check all inputs, print the stages, and write no files.")]
 Quiet = Annotated[bool, Option("-q", "--quiet", help="Print only results, warnings and failures.")]
 
 
 def output(text: str, metavar: str = "DIR") -> Any:
     """Return the option for the output folder or file, with ``text`` as its help, which states the default."""
     return Option("-o", "--out", metavar=metavar, help=text)
+
+
+# Options that several commands have, by the field of :class:`~aerpaw_cmp.jobs.options.RunOptions` that they set.
+_OF_RUN = {
+    "logs_root": LogsRoot,
+    "workers": Annotated[int, Option(min=1, help="Number of local workers that share the tasks.")],
+    "scheduler": Annotated[
+        str | None,
+        Option("--scheduler", "--cluster", help="Address of a Dask scheduler to use instead of local workers."),
+    ],
+    "dry": Annotated[bool, Option("--dry-run", help="Check all inputs, print the stages, and write no files.")],
+    "force": Force,
+}
+
+
+def of_run(out: str, *names: str, metavar: str = "DIR") -> dict[str, Any]:
+    """Return the options that fill the :class:`RunOptions` of a command: ``--out`` with its help, then others."""
+    return {"out": Annotated[Path | None, output(out, metavar)]} | {name: _OF_RUN[name] for name in names}
 
 
 def command(
@@ -80,6 +92,7 @@ def command(
     of: typer.Typer = app,
     text: str | None = None,
     kind: type[TyperCommand] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Callable[[_Function], _Function]:
     """Register a function as a command.
 
@@ -94,12 +107,14 @@ def command(
         One line of help; the default is that of :data:`aerpaw_cmp.common.text.COMMANDS`.
     kind : type, optional
         Class that reads the arguments.
+    options : mapping, optional
+        Result of :func:`of_run`. The function receives their values as its argument ``options``.
     """
     epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in examples)
     register = of.command(name, cls=kind, help=COMMANDS[name] if text is None else text, epilog=epilog)
 
     def take(function: _Function) -> _Function:
-        register(_with_common_options(function))
+        register(_with_common_options(function, options or {}))
         return function
 
     return take
@@ -119,8 +134,8 @@ def _bare(hint: Any) -> Any:
     return inner[0] if get_origin(hint) is Union and get_origin(inner[0]) is Annotated else hint
 
 
-def _with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add ``--json`` and ``--quiet`` to a command, and let interrupts reach :func:`aerpaw_cmp.cli.main`."""
+def _with_common_options(function: Callable[..., Any], of_run: Mapping[str, Any]) -> Callable[..., Any]:
+    """Add the options of its run, ``--json`` and ``--quiet`` to a command, and let interrupts reach ``cli.main``."""
 
     @functools.wraps(function)
     def run(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> Any:
@@ -130,6 +145,9 @@ def _with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 # click accepts nan, because nan is never outside a minimum or maximum
                 if isinstance(number, float) and not math.isfinite(number):
                     raise UsageError(f"--{option.replace('_', '-')} {number}", expected="a finite number")
+        if of_run:
+            values = {name: arguments.pop(name) for name in of_run}
+            arguments["options"] = RunOptions(progress=say, **values)
         try:
             return function(**arguments)
         except NotRun as ended:
@@ -140,11 +158,12 @@ def _with_common_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
     # resolve annotations here, because typer would evaluate these texts in its own module
     hints = {name: _bare(hint) for name, hint in get_type_hints(function, include_extras=True).items()}
-    hints |= {"as_json": Json, "quiet": Quiet}
+    added = {**of_run, "as_json": Json, "quiet": Quiet}
+    hints |= added
     kind = inspect.Parameter.KEYWORD_ONLY
     parameters = [
-        *inspect.signature(function).parameters.values(),
-        *(inspect.Parameter(name, kind, default=False) for name in ("as_json", "quiet")),
+        *(parameter for name, parameter in inspect.signature(function).parameters.items() if name != "options"),
+        *(inspect.Parameter(name, kind, default=getattr(DEFAULT, name, False)) for name in added),
     ]
     typed = [parameter.replace(kind=kind, annotation=hints[parameter.name]) for parameter in parameters]
     run.__signature__ = inspect.Signature(typed)  # type: ignore[attr-defined]  # typer reads the options here

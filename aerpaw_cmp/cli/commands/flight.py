@@ -11,7 +11,7 @@ from typer import Argument, Option
 from ...common.errors import typed
 from ...common.text import counted
 from ...jobs.options import AGAINST_DISTANCE_M, RunOptions
-from ..app import DryRun, Figures, Force, LogsRoot, command, output
+from ..app import Figures, Force, command, of_run, output
 from ..shown import answered, number, print_files, records, say, show, table, warn_all
 
 
@@ -28,11 +28,11 @@ from ..shown import answered, number, print_files, records, say, show, table, wa
         "aerpaw-cmp report flight.yaml --against matlab.csv --against sionna_map.npz",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",
     ],
+    options=of_run("Output folder  [default: reports/<flight>]", "logs_root", "dry", "force"),
 )
 def report(
+    options: RunOptions,
     flight: Annotated[Path, Argument(help="flight.yaml")],
-    out: Annotated[Path | None, output("Output folder  [default: reports/<flight>]")] = None,
-    logs_root: LogsRoot = None,
     audit: Annotated[
         str | None,
         Option(help="Number of audited links, 'full' or 'none'; ignores the cache  [default: rt.audit_links]"),
@@ -56,8 +56,6 @@ def report(
     figures: Figures = "none",
     kmz: Annotated[bool, Option("--kmz", help="Also write samples.kmz for Google Earth and QGIS.")] = False,
     netcdf: Annotated[bool, Option("--netcdf", help="Also write rss.nc and rank.nc for xarray and MATLAB.")] = False,
-    dry_run: DryRun = False,
-    force: Force = False,
 ) -> int:
     """Replay a flight, calibrate the prediction, compare it with the logs, and write the report."""
     from ...jobs import run
@@ -72,7 +70,6 @@ def report(
         kmz=kmz,
         netcdf=netcdf,
     )
-    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_report(flight, chosen, options)
     if not answered(outcome.metrics):
         _print_report_summary(outcome)
@@ -193,26 +190,27 @@ def _print_report_summary(outcome: Any) -> None:
         "aerpaw-cmp calibrate calibration.yaml --into-site my_site.yaml",
         "aerpaw-cmp calibrate calibration.yaml --score next_flight.yaml --score another.yaml",
     ],
+    options=of_run(
+        "File for the learned settings  [default: <calibration>.calibrated.yaml]",
+        "logs_root",
+        "dry",
+        "force",
+        metavar="FILE",
+    ),
 )
 def calibrate(
+    options: RunOptions,
     flights: Annotated[list[Path], Argument(metavar="FLIGHT", help="flight.yaml files, or a calibration.yaml.")],
-    out: Annotated[
-        Path | None, output("File for the learned settings  [default: <calibration>.calibrated.yaml]", "FILE")
-    ] = None,
-    logs_root: LogsRoot = None,
     into_site: Annotated[
         str | None, Option(metavar="SITE", help="Site that stores the learned antennas; drafts then use them by name.")
     ] = None,
     score: Annotated[
         list[Path] | None, Option(help="flight.yaml to score with the learned settings; repeatable.")
     ] = None,
-    dry_run: DryRun = False,
-    force: Force = False,
 ) -> None:
     """Learn antennas and ground from several flights."""
     from ...jobs import run
 
-    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_calibrate(flights[0], options, further=flights[1:], into_site=into_site, score=score or ())
     if answered(outcome.metrics):
         return
@@ -245,17 +243,12 @@ def calibrate(
 @command(
     "simulate",
     examples=["aerpaw-cmp simulate plan/flight.yaml", "aerpaw-cmp simulate plan/flight.yaml -o planned --json"],
+    options=of_run("Output folder  [default: simulated/<flight>]", "dry", "force"),
 )
-def simulate(
-    flight: Annotated[Path, Argument(help="flight.yaml with flight.plan")],
-    out: Annotated[Path | None, output("Output folder  [default: simulated/<flight>]")] = None,
-    dry_run: DryRun = False,
-    force: Force = False,
-) -> None:
+def simulate(options: RunOptions, flight: Annotated[Path, Argument(help="flight.yaml with flight.plan")]) -> None:
     """Simulate a planned flight and write its logs in the real formats."""
     from ...jobs import run
 
-    options = RunOptions(out=out, force=force, progress=say, dry=dry_run)
     outcome = run.run_simulate(flight, options)
     warn_all(outcome.warnings)
     print_files(outcome.files)

@@ -10,8 +10,8 @@ from typer import Argument, Option
 
 from ...common.text import counted
 from ...jobs.options import RunOptions
-from ..app import DryRun, Flights, Force, LogsRoot, command, output
-from ..shown import answered, print_files, records, say, show, warn_all
+from ..app import Flights, command, of_run
+from ..shown import answered, print_files, records, show, warn_all
 
 _HEIGHT = Option(
     min=0.1, max=10_000.0,
@@ -29,8 +29,10 @@ _HEIGHT = Option(
         "aerpaw-cmp predict next_flight.yaml --with flight1.yaml",
         "aerpaw-cmp predict lake_wheeler --with flight1.yaml --height 40 --height 80 --spacing 30",
     ],
+    options=of_run("Output folder  [default: reports/prediction-<WHERE>]", "logs_root", "dry", "force"),
 )
 def predict(
+    options: RunOptions,
     where: Annotated[
         Path,
         Argument(
@@ -41,7 +43,6 @@ def predict(
     ],
     flights: Flights = None,
     site: Annotated[str | None, Option(help="Site of a route or of points, without --with.")] = None,
-    out: Annotated[Path | None, output("Output folder  [default: reports/prediction-<WHERE>]")] = None,
     height: Annotated[list[float] | None, _HEIGHT] = None,
     spacing: Annotated[float | None, Option(min=1.0, help="Spacing of a grid [m]  [default: 30]")] = None,
     heading: Annotated[
@@ -52,27 +53,20 @@ def predict(
         float | None, Option(min=0.1, max=100.0, help="Carrier frequency, if no flight is given [GHz].")
     ] = None,
     tx_power_dbm: Annotated[float | None, Option(help="Transmit power, if no flight is given [dBm].")] = None,
-    logs_root: LogsRoot = None,
-    dry_run: DryRun = False,
-    force: Force = False,
 ) -> None:
     """Predict level and rank with error bars for positions without flights."""
     from ...jobs.predict import run_predict
     from ...jobs.sources import TargetOptions
 
-    outcome = run_predict(
-        where,
-        flights or (),
-        TargetOptions(
-            heights_m=tuple(height or (40.0,)),
-            spacing_m=spacing,
-            heading_deg=heading,
-            site=site,
-            carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
-            tx_power_dbm=tx_power_dbm,
-        ),
-        RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run),
+    target = TargetOptions(
+        heights_m=tuple(height or (40.0,)),
+        spacing_m=spacing,
+        heading_deg=heading,
+        site=site,
+        carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
+        tx_power_dbm=tx_power_dbm,
     )
+    outcome = run_predict(where, flights or (), target, options)
     if not answered(outcome.metrics):
         _print_prediction(outcome)
 
@@ -102,8 +96,10 @@ _ROUTES = Option("--route", metavar="FILE", help="Another candidate: .plan, KML,
         "aerpaw-cmp plan lake_wheeler --with flight1.yaml --with flight2.yaml --geofence fence.kml -o next",
         "aerpaw-cmp plan mission.plan --with flight1.yaml --route a.kml --route b.plan",
     ],
+    options=of_run("Output folder  [default: reports/plan-<TARGET>]", "logs_root", "dry", "force"),
 )
 def plan(
+    options: RunOptions,
     target: Annotated[str, Argument(help="Target: sphere (all directions), a site (a grid), a route, or points.")],
     flights: Flights = None,
     site: Annotated[str | None, Option(help="Site, if no flight names it.")] = None,
@@ -117,16 +113,12 @@ def plan(
     speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
     height: Annotated[list[float] | None, _HEIGHT] = None,
     tower_distance: Annotated[float, Option(min=0.0, help="Smallest distance to towers [m].")] = 30.0,
-    out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
-    logs_root: LogsRoot = None,
-    dry_run: DryRun = False,
-    force: Force = False,
 ) -> None:
     """Rank candidate flights by how much they would reduce the prediction's standard deviation."""
     from ...jobs.next_flight import PlanOptions, run_plan
     from ...jobs.sources import TargetOptions
 
-    options = PlanOptions(
+    chosen = PlanOptions(
         minutes=minutes,
         speed_mps=speed,
         heights_m=tuple(height or (40.0,)),
@@ -137,9 +129,7 @@ def plan(
         towers=tuple(tower or ()),
         target=TargetOptions(heights_m=tuple(height or (40.0,)), grid_spacing_m=60.0, site=site),
     )
-    outcome = run_plan(
-        target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
-    )
+    outcome = run_plan(target, flights or (), chosen, options)
     if not answered(outcome.metrics):
         _print_plan(outcome)
 
@@ -165,10 +155,11 @@ def _print_plan(outcome: Any) -> None:
         "aerpaw-cmp channel flight.yaml --route plan.kml --tower LW1 --format netcdf --format csv",
         "aerpaw-cmp channel flight.yaml --link rank --bandwidth 20e6 --subcarriers 64 --step 5",
     ],
+    options=of_run("Output folder  [default: reports/channel-<flight>]", "logs_root", "force"),
 )
 def channel(
+    options: RunOptions,
     flight: Annotated[Path, Argument(help="flight.yaml with logs, with a plan, or with --route.")],
-    out: Annotated[Path | None, output("Output folder  [default: reports/channel-<flight>]")] = None,
     route: Annotated[
         Path | None, Option(metavar="FILE", help="Route instead of the track: .plan, KML, CSV or log.")
     ] = None,
@@ -186,8 +177,6 @@ def channel(
     subcarriers: Annotated[
         int | None, Option(min=1, max=65536, help="Number of subcarriers of the band  [default: 1024]")
     ] = None,
-    logs_root: LogsRoot = None,
-    force: Force = False,
 ) -> None:
     """Write the channel along a flight or a route for the next simulation."""
     from ...jobs.channel import ChannelOptions, run_channel
@@ -201,7 +190,7 @@ def channel(
         bandwidth_hz=bandwidth,
         subcarriers=subcarriers,
     )
-    outcome = run_channel(flight, chosen, RunOptions(out=out, logs_root=logs_root, force=force, progress=say))
+    outcome = run_channel(flight, chosen, options)
     m = outcome.metrics
     which = f"Link {m['link']}{'' if link else ' (the default)'}, {m['carrier_hz'] / 1e9:g} GHz"
     size = f"{counted(m['paths'], 'path')}, {counted(m['poses'], 'pose')}"
@@ -220,19 +209,17 @@ def _print(outcome: Any, sentence: str) -> None:
 @command(
     "locate",
     examples=["aerpaw-cmp locate flight.yaml -o where", "aerpaw-cmp locate flight.yaml --channel USRP1 --follow"],
+    options=of_run("Output folder  [default: reports/locate-<flight>]", "logs_root", "force"),
 )
 def locate(
+    options: RunOptions,
     flight: Annotated[Path, Argument(help="flight.yaml with telemetry and a log of levels; its nodes are not used.")],
-    out: Annotated[Path | None, output("Output folder  [default: reports/locate-<flight>]")] = None,
     channel: Annotated[str | None, Option(help="Channel of the logs  [default: the first]")] = None,
     follow: Annotated[bool, Option("--follow", help="Repeat every 10 s while the logs grow, until Ctrl-C.")] = False,
-    logs_root: LogsRoot = None,
-    force: Force = False,
 ) -> None:
     """Locate an unknown ground node from the levels of a flight."""
     from ...jobs.locate import run_locate
 
-    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
     while True:
         outcome = run_locate(flight, options, channel)
         _print(outcome, outcome.metrics["sentence"])

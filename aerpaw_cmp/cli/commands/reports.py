@@ -11,7 +11,7 @@ from typer import Argument, Option
 from ...common.errors import one_line
 from ...common.text import counted
 from ...jobs.options import RunOptions
-from ..app import DryRun, Force, LogsRoot, Scheduler, Workers, command, output
+from ..app import LogsRoot, command, of_run
 from ..shown import answered, number, records, say, show, table
 
 
@@ -148,27 +148,20 @@ def _print_numbers(comparison: Any) -> None:
         "aerpaw-cmp campaign campaign.yaml --scheduler tls://scheduler:8786 --keep /shared/outcomes",
         "aerpaw-cmp campaign campaign.yaml --dry-run",
     ],
+    options=of_run("Output folder  [default: reports/<campaign>]", "logs_root", "workers", "scheduler", "dry", "force"),
 )
 def campaign(
+    options: RunOptions,
     campaign_yaml: Annotated[Path, Argument(metavar="CAMPAIGN", help="campaign.yaml")],
-    out: Annotated[Path | None, output("Output folder  [default: reports/<campaign>]")] = None,
-    logs_root: LogsRoot = None,
-    workers: Workers = 1,
-    scheduler: Scheduler = None,
     keep: Annotated[
         Path | None, Option(help="Folder for task outcomes; a rerun computes only missing outcomes.")
     ] = None,
     fresh: Annotated[bool, Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
-    dry_run: DryRun = False,
     strict: Annotated[bool, Option("--strict", help="Also end with exit code 1 if a check failed.")] = False,
-    force: Force = False,
 ) -> int:
     """Compare many flights under many settings."""
     from ...jobs import run
 
-    options = RunOptions(
-        out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
-    )
     outcome = run.run_campaign(campaign_yaml, options, keep=keep, fresh=fresh)
     if not answered(outcome.metrics):
         _print_campaign_summary(outcome)

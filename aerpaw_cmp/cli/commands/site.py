@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from ...common.errors import UsageError
 from ...jobs.options import RunOptions
-from ..app import DryRun, Figures, Flights, Force, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
+from ..app import Figures, Flights, Force, antenna_app, command, of_run, output, site_app
 from ..shown import answered, print_files, records, say, show, table, warn_all
 
 
@@ -105,16 +105,16 @@ def site_export(
     of=site_app,
     text="Draw the plan of a site, and write a standalone page that shows it in 3-D.",
     examples=["aerpaw-cmp site show", "aerpaw-cmp site show site.yaml -o reports/site"],
+    options=of_run("Output folder  [default: reports/site-<site>]", "force"),
 )
 def site_show(
+    options: RunOptions,
     site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
-    out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
-    force: Force = False,
 ) -> None:
     """Show the plan of a site and its 3-D page."""
     from ...jobs import run
 
-    shown = run.run_site_show(site, RunOptions(out=out, force=force))
+    shown = run.run_site_show(site, options)
     if not say.as_json:
         from ...site.learned import memory_lines
 
@@ -161,10 +161,11 @@ def antenna_export(
         "aerpaw-cmp map site.yaml --tx-power-dbm 30 --bandwidth-mhz 20 --noise-figure-db 7 --threshold-dbm -90",
         "aerpaw-cmp map lake_wheeler --with flight1.yaml --with flight2.yaml",
     ],
+    options=of_run("Output folder  [default: reports/map-<site>]", "logs_root", "workers", "scheduler", "dry", "force"),
 )
 def map_(
+    options: RunOptions,
     site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
-    out: Annotated[Path | None, output("Output folder  [default: reports/map-<site>]")] = None,
     quick: Annotated[bool, Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
     foliage: Annotated[
         list[str] | None, Option(help="none, attenuating, opaque or all; repeatable  [default: all]")
@@ -191,7 +192,6 @@ def map_(
     ] = None,
     threshold_snr_db: Annotated[float | None, Option(help="Lowest SNR that counts as coverage [dB].")] = None,
     flights: Flights = None,
-    logs_root: LogsRoot = None,
     study: Annotated[
         bool, Option("--study/--no-study", help="Also study spatial correlation and interpolation.")
     ] = True,
@@ -200,10 +200,6 @@ def map_(
         Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
     ] = None,
     figures: Figures = "none",
-    workers: Workers = 1,
-    scheduler: Scheduler = None,
-    dry_run: DryRun = False,
-    force: Force = False,
 ) -> None:
     """Map coverage and rank of a site."""
     from ...jobs import run
@@ -226,9 +222,6 @@ def map_(
         "threshold_snr_db": threshold_snr_db,
     }
     settings = map_settings(site, chosen, quick=quick)
-    options = RunOptions(
-        out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
-    )
     if not say.as_json:
         show(settings.budget.sentence())
     outcome = run.run_map(site, settings, options, flights=flights or (), figures=figures)

@@ -39,7 +39,7 @@ _PAIR_SHARE, _MOST_PAIRS = 0.01, 400
 
 def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
     """Return the gain over the sphere of every antenna, by ``(tower.channel, "uav" or "tower")``."""
-    theta, azimuth, vectors = learned.sphere_grid()
+    vectors = learned.sphere_grid()[2]
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
     fit, out = calibration.fit, {}
     for antenna in fit.antennas:
@@ -50,8 +50,7 @@ def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]
             gain_dbi = learned.unit_mean_gain(raw)
             out[antenna, end] = AntennaMap(
                 name=f"{antenna} {end}",
-                theta_deg=theta,
-                azimuth_deg=azimuth,
+                directions=vectors,
                 gain_dbi=gain_dbi,
                 sd_db=sd.reshape(shape),
                 level_db=float((raw - gain_dbi).flat[0]),

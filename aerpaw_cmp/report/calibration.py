@@ -29,7 +29,8 @@ class AntennaMap:
     ----------
     name : str
         Name, such as ``LW1.USRP1 tower``.
-    theta_deg, azimuth_deg : (t,), (p,)
+    directions : (t, p, 3)
+        Unit vectors of the grid, from the zenith to the nadir.
     gain_dbi, sd_db : (t, p)
     level_db : float
         Level that was subtracted from the learned gain, so that its mean is 0 dBi.
@@ -38,8 +39,7 @@ class AntennaMap:
     """
 
     name: str
-    theta_deg: FloatArray
-    azimuth_deg: FloatArray
+    directions: FloatArray
     gain_dbi: FloatArray
     sd_db: FloatArray
     level_db: float
@@ -196,19 +196,13 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def _directions(antenna: AntennaMap) -> FloatArray:
-    """Return unit vectors of the grid, shape (t, p, 3)."""
-    t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
-    return np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
-
-
 def _share_seen(antenna: AntennaMap) -> float:
     """Return the share of the sphere within 10 degrees of a direction that a flight measured."""
-    grid = _directions(antenna)
+    grid = antenna.directions
     near = np.zeros(grid.shape[:2], bool)
     for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
         near |= (grid @ part.T > np.cos(np.radians(10.0))).any(axis=-1)
-    weight = np.sin(np.radians(antenna.theta_deg))[:, None] * np.ones_like(near)
+    weight = np.hypot(grid[..., 0], grid[..., 1])  # the area of a cell, which is zero at a pole
     return float((near * weight).sum() / weight.sum())
 
 
@@ -221,7 +215,7 @@ def _groups(data: CalibrationData) -> Iterator[Places]:
     for a in data.antennas:
         yield Places(
             name=a.name,
-            at=_directions(a).reshape(-1, 3),
+            at=a.directions.reshape(-1, 3),
             values={"gain [dBi]": a.gain_dbi.ravel(), "standard deviation [dB]": a.sd_db.ravel()},
             around=BODY if a.name.endswith(" uav") else COMPASS,
             dots=a.flown,

@@ -18,7 +18,7 @@ import json
 import math
 import re
 import zlib
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -778,9 +778,8 @@ class PairGain:
         """Return the content of a table of the directions, gains and standard deviations, with comments at its head."""
         angles = np.concatenate([angles_of(self.directions[:, :3]), angles_of(self.directions[:, 3:])], axis=1)
         rows = np.column_stack([angles, self.gain_db, self.sd_db])
-        lines = [guarded_comment(f"# {note}") for note in notes] + [",".join(PAIR_COLUMNS)]
-        lines += [f"{a:.1f},{b:.1f},{c:.1f},{d:.1f},{g:.2f},{s:.2f}" for a, b, c, d, g, s in rows]
-        return "\n".join(lines) + "\n"
+        lines = (f"{a:.1f},{b:.1f},{c:.1f},{d:.1f},{g:.2f},{s:.2f}" for a, b, c, d, g, s in rows)
+        return _table(notes, PAIR_COLUMNS, lines)
 
 
 PAIR_COLUMNS = ("uav_azimuth_deg", "uav_elevation_deg", "tower_azimuth_deg", "tower_elevation_deg", "gain_db", "sd_db")
@@ -932,13 +931,16 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
     """
     rows, columns = gain_dbi.shape
     theta, phi = np.linspace(0.0, 180.0, rows), np.arange(columns) * (360.0 / columns)
-    lines = [guarded_comment(f"# {note}") for note in notes] + [",".join(SPHERE_COLUMNS)]
-    for i in range(rows):
-        lines += [
-            f"{phi[j]:g},{90.0 - theta[i]:g},{gain_dbi[i, j]:.{decimals}f},{sd_db[i, j]:.{decimals}f}"
-            for j in range(columns)
-        ]
-    return "\n".join(lines) + "\n"
+    lines = (
+        f"{phi[j]:g},{90.0 - theta[i]:g},{gain_dbi[i, j]:.{decimals}f},{sd_db[i, j]:.{decimals}f}"
+        for i, j in np.ndindex(rows, columns)
+    )
+    return _table(notes, SPHERE_COLUMNS, lines)
+
+
+def _table(notes: Sequence[str], columns: Sequence[str], lines: Iterable[str]) -> str:
+    """Return a CSV table with comments above its header."""
+    return "\n".join([*(guarded_comment(f"# {note}") for note in notes), ",".join(columns), *lines, ""])
 
 
 @parsed("a table of gain over direction")
@@ -1076,11 +1078,12 @@ class DirectionCovariance:
 
     def table(self, notes: Sequence[str]) -> str:
         """Return the content of the table, with comments at its head."""
-        lines = [guarded_comment(f"# {note}") for note in notes] + [",".join(_COLUMNS)]
-        for number, (azimuth, elevation) in enumerate(angles_of(self.directions)):
-            row = self.covariance_db2[number, : number + 1]
-            lines.append(f"{azimuth:.1f},{elevation:.1f}," + ",".join(f"{value:.2f}" for value in row))
-        return "\n".join(lines) + "\n"
+        rows = enumerate(np.column_stack([angles_of(self.directions), self.covariance_db2]))
+        lines = (
+            f"{azimuth:.1f},{elevation:.1f}," + ",".join(f"{value:.2f}" for value in row[: number + 1])
+            for number, (azimuth, elevation, *row) in rows
+        )
+        return _table(notes, _COLUMNS, lines)
 
 
 @parsed(_WHAT)

@@ -67,7 +67,7 @@ def long_page(folder: Path, samples: int = 50_000) -> Path:
     from aerpaw_cmp.report import flight as write
     from benchmarks.fabricated import long_flight
 
-    return write.write_report(long_flight(samples), folder / "long").files[0]
+    return write.write_report(long_flight(samples), folder / "long")[0][0]
 
 
 def map_page(folder: Path) -> Path:

@@ -272,12 +272,12 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             target.write(sealed(text))
             record = replace(record, extra_metrics={**record.extra_metrics, "recommended": sentence})
         with output.filling() as place:
-            written = write_report(
+            _, record = write_report(
                 record, place, drawn=chosen.figures, kmz=chosen.kmz, netcdf=chosen.netcdf, stages=stages
             )
             if cards:
                 write_file(place / "card.json", json_text(cards, indent=1))
-    metrics = metrics_of(written.data)
+    metrics = metrics_of(record)
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=_failed_checks(metrics))
 
 

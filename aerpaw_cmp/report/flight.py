@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -265,13 +264,12 @@ def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption
 
 def referee_card(data: ReportData) -> Card:
     """Return the card that compares predictions of other programs with ray tracing and the baselines."""
-    return Card(
-        title="Predictions of other programs",
-        id="referee",
-        text=["Every model is scored on the samples that the prediction covers. Fitted on this flight: one offset per "
-              "model and channel."] if data.extra_metrics.get("referee") else [],
-        parts=[_prediction_card(verdict) for verdict in data.extra_metrics.get("referee", ())],
-    )  # fmt: skip
+    parts = [_prediction_card(verdict) for verdict in data.extra_metrics.get("referee", ())]
+    text = (
+        "Every model is scored on the samples that the prediction covers. Fitted on this flight: one offset per model "
+        "and channel."
+    )
+    return Card(title="Predictions of other programs", id="referee", text=[text] if parts else [], parts=parts)
 
 
 def _prediction_card(verdict: Mapping[str, Any]) -> Card:
@@ -560,14 +558,6 @@ def page(data: ReportData, files: Sequence[str]) -> str:
 # --- the folder -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WrittenReport:
-    """The files of a report, ``report.html`` first, and its data with the seconds of all stages."""
-
-    files: tuple[Path, ...]
-    data: ReportData
-
-
 def write_report(
     data: ReportData,
     folder: str | Path,
@@ -576,7 +566,7 @@ def write_report(
     kmz: bool = False,
     netcdf: bool = False,
     stages: Stages | None = None,
-) -> WrittenReport:
+) -> tuple[list[Path], ReportData]:
     """Write the files of a report.
 
     Parameters
@@ -595,8 +585,10 @@ def write_report(
 
     Returns
     -------
-    WrittenReport
+    files : list of Path
         ``report.html``, the CSV files (only a header if they have no rows), the figures, ``metrics.json``.
+    data : ReportData
+        The data with the seconds of all stages.
 
     Raises
     ------
@@ -629,4 +621,4 @@ def write_report(
         html = write_file(folder / "report.html", page(data, files))
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     numbers = write_file(folder / "metrics.json", json_text(metrics(data)))
-    return WrittenReport(files=(html, *written, numbers), data=data)
+    return [html, *written, numbers], data

@@ -177,11 +177,6 @@ class ReportData(FlightResult):
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
     paths: tuple[PosePaths, ...] = ()
 
-    @property
-    def moments(self) -> list[tuple[str, np.datetime64]]:
-        """The label and time of each waypoint."""
-        return [(waypoint.label, waypoint.time) for waypoint in self.waypoints]
-
 
 def start_of(data: ReportData) -> np.datetime64:
     """Return the zero of all time axes: the first time of the track, or of any series."""

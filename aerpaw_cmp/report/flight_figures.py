@@ -132,7 +132,7 @@ def over_time(
     Figure
     """
     start = start_of(data)
-    points = [(label, float((time - start) / np.timedelta64(1, "s"))) for label, time in data.moments]
+    points = [(point.label, float((point.time - start) / np.timedelta64(1, "s"))) for point in data.waypoints]
     fig, grid = canvas.subplots(
         (9.2, 0.7 + sum(high_in)), len(panels), 1, sharex=True, height_ratios=high_in, squeeze=False
     )

@@ -32,7 +32,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 @pytest.fixture(scope="module")
 def page(small_report, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
-    return write.write_report(small_report, folder).files[0]
+    return write.write_report(small_report, folder)[0][0]
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +216,7 @@ class TestPage(PageLaws):
 
 def test_only_rank(small_report, tmp_path, driver, page):
     bare = dataclasses.replace(small_report, rss=(), pairs=())
-    path = write.write_report(bare, tmp_path).files[0]
+    path = write.write_report(bare, tmp_path)[0][0]
     open_page(driver, path, "window.explorer")
     try:
         assert driver.execute_script("return explorer.rankStatistics().n") == np.isfinite(bare.rank[0].measured).sum()
@@ -255,7 +255,7 @@ def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(dr
 def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_report, tmp_path):
     first, *rest = small_report.rss
     learned = with_numbers(first, trained_on=("0" * 64,))
-    page = write.write_report(dataclasses.replace(small_report, rss=(learned, *rest)), tmp_path).files[0]
+    page = write.write_report(dataclasses.replace(small_report, rss=(learned, *rest)), tmp_path)[0][0]
     browser = start("--window-size=1440,1200")
     try:
         open_page(browser, page, "window.explorer")

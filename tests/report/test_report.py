@@ -11,7 +11,7 @@ from aerpaw_cmp.report.flight_figures import figure_specs
 
 
 def test_whole_report(small_report, tmp_path):
-    files = write.write_report(small_report, tmp_path).files
+    files = write.write_report(small_report, tmp_path)[0]
     assert files[0] == tmp_path / "report.html"
     assert all(f.stat().st_size > 0 for f in files)
     assert (
@@ -24,7 +24,7 @@ def test_whole_report(small_report, tmp_path):
 @pytest.mark.parametrize(("drawn", "suffixes"), [("none", set()), ("svg", {".svg"}), ("all", {".svg", ".png", ".pdf"})])
 def test_figures_are_drawn_as_asked(small_report, tmp_path, drawn, suffixes):
     data = dataclasses.replace(small_report, rss=(), pairs=(), rank=())
-    files = write.write_report(data, tmp_path, drawn=drawn).files
+    files = write.write_report(data, tmp_path, drawn=drawn)[0]
     figures = [f for f in files if f.parent.name == "figures"]
     assert {f.suffix for f in figures} == suffixes
     assert len(figures) == len(suffixes) * len(figure_specs(data))
@@ -35,9 +35,9 @@ def test_the_seconds_of_the_writing_are_told(small_report, tmp_path):
     stages = Stages()
     with stages("replay"):
         pass
-    written = write.write_report(small_report, tmp_path, drawn="none", stages=stages)
+    _, written = write.write_report(small_report, tmp_path, drawn="none", stages=stages)
     numbers = json.loads((tmp_path / "metrics.json").read_text())["stages"]
-    assert numbers["report_s"] == written.data.stages_s["report"] > 0
+    assert numbers["report_s"] == written.stages_s["report"] > 0
     assert "replay_s" in numbers
 
 

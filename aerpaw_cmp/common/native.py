@@ -165,8 +165,7 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
             }
             if netcdf:
                 notes["dims"] = {name: _dimensions(item) for name, item in items.items()}
-                units = {name: _text(item.attrs.get("units", b"")) for name, item in items.items()}
-                notes["units"] = {name: unit for name, unit in units.items() if unit}
+                notes["units"] = {n: unit for n, item in items.items() if (unit := _text(item.attrs.get("units", b"")))}
             return {name: _plain(np.asarray(item[()])) for name, item in items.items()}, notes
 
     with h5py.File("warm", "w", driver="core", backing_store=False) as book:

@@ -111,13 +111,10 @@ def _distribution(
     measured_db: FloatArray, predicted: Mapping[str, FloatArray], both: BoolArray
 ) -> tuple[float | None, float | None]:
     """Return CRPS and coverage of the predicted 90 % band. None if the prediction does not state them."""
-
-    def known(*names: str) -> bool:
-        return all(name in predicted and np.isfinite(predicted[name][both]).all() for name in names)
-
+    known = {name for name, numbers in predicted.items() if np.isfinite(numbers[both]).all()}
     level, crps, lock, band = predicted["level"], None, None, None
-    if known("sd_db"):
-        if known(*LOCK):
+    if "sd_db" in known:
+        if known.issuperset(LOCK):
             lock = LostLock(
                 probability=predicted["p_lock"],
                 locked_db=predicted["locked_db"] - level,
@@ -129,7 +126,7 @@ def _distribution(
         crps = stated.crps_db(np.where(both, measured_db - level, np.nan))
         low_db, high_db = stated.band_db(BAND)
         band = level + low_db, level + high_db
-    if known("q05_db", "q95_db"):
+    if known.issuperset(("q05_db", "q95_db")):
         band = predicted["q05_db"], predicted["q95_db"]
     return crps, band and float(np.mean(((measured_db >= band[0]) & (measured_db <= band[1]))[both]))
 

@@ -22,7 +22,7 @@ import pandas as pd
 from ..common.content import KEY, MARKS
 from ..common.errors import InputError, UsageError, about_file, parsing
 from ..common.files import LARGEST_TABLE, read_bounded, read_input
-from ..common.jsonable import json_safe
+from ..common.jsonable import json_object
 from ..common.native import read as read_native
 from ..common.outputs import file_digest
 from ..common.text import counted
@@ -118,10 +118,6 @@ class ForeignPrediction:
     remarks: tuple[str, ...] = ()
     unit: str = ""
     near_m: float = AGAINST_DISTANCE_M
-
-    def absolute(self, unit: str) -> bool:
-        """Check whether the levels need no offset to be compared with a log in a unit."""
-        return self.unit in ("", unit) if self.quantity == "level_db" else unit == "dBm"
 
     @property
     def timed(self) -> bool:
@@ -423,10 +419,9 @@ def _check_repeats(table: pd.DataFrame) -> None:
     twice = distinct[distinct.duplicated(key, keep=False)]
     if len(twice):
         first = twice[key].iloc[0].drop("channel").dropna()
-        where = ", ".join(f"{name} {f'{v:.2f}' if isinstance(v, float) else v}" for name, v in first.items())
-        one = "time" if "time" in key else "position"
+        at = ", ".join(f"{name} {f'{v:.2f}' if isinstance(v, float) else v}" for name, v in first.items())
         raise InputError(
-            f"{counted(len(twice), 'row')} with several levels at one {one}: {where}",
+            f"{counted(len(twice), 'row')} with several levels at one {'time' if 'time' in key else 'position'}: {at}",
             expected="one row per tower, channel and time or position",
             cause="two channels or two heights, but no column for the channel or the height",
         )
@@ -495,26 +490,23 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     if series and (few := [item.name for item in result.rss if item.tower in predicted and item.name not in series]):
         remarks.append(f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have a predicted level; not scored.")
     if trained := [item.name for item in result.rss if item.training and item.name in series]:
-        names = ", ".join(trained)
-        remarks.append(f"Ray tracing has no score on {names}: its antennas were learned from this flight.")
+        remarks.append(f"Ray tracing has no score on {', '.join(trained)}: its antennas were learned from this flight.")
     if len(common) < len(series):
-        channels = f"{', '.join(common)} only"
-        remarks.append(f"The means are over {channels}: the other channels are not predicted by all models.")
-    score: dict[str, Any] = json_safe({
-        "prediction": name,
-        "sha256": given.sha256,
-        "fitted_on_this_flight": ["the offset of each model and channel"],
-        "sentence": _sentence(given, every, list(common.values()), means) if series else f"{name}: ranks only.",
-        "remarks": remarks,
-        "means": means,
-        "levels": {s["tower"]: {o["channel"]: o for o in every if o["tower"] == s["tower"]} for s in every},
-        "nodes": [
-            {"series": link, **{key: entry["cards"][name][key] for key in ("offset_db", "slope")},
-             "floor_db": entry["floor_db"]} for link, entry in series.items()
+        remarks.append(f"The means are over {', '.join(common)} only: not all models predict the other channels.")
+    return json_object(
+        prediction=name,
+        sha256=given.sha256,
+        fitted_on_this_flight=["the offset of each model and channel"],
+        sentence=_sentence(given, every, list(common.values()), means) if series else f"{name}: ranks only.",
+        remarks=remarks,
+        means=means,
+        levels={s["tower"]: {o["channel"]: o for o in every if o["tower"] == s["tower"]} for s in every},
+        nodes=[
+            {"series": link, "offset_db": card["offset_db"], "slope": card["slope"], "floor_db": entry["floor_db"]}
+            for link, entry, card in ((link, entry, entry["cards"][name]) for link, entry in series.items())
         ],
-        "rank": ranks,
-    })  # fmt: skip
-    return score
+        rank=ranks,
+    )
 
 
 def _means(model: str, cards: Entries) -> dict[str, Any]:
@@ -530,11 +522,9 @@ def _sentence(given: ForeignPrediction, series: Entries, common: Entries, means:
     if referee.OURS in errors:
         verdicts = Counter(entry["differences"][referee.OURS].verdict for entry in common)
         decided = [f"significantly {kind} on {verdicts[kind]}" for kind in ("better", "worse") if verdicts[kind]]
-        text += (
-            f", ray tracing {errors[referee.OURS]:.1f} dB on the same samples ({counted(len(common), 'channel')}). "
-            + (f"It is {' and '.join(decided)}" if decided else "The difference is not significant on any channel")
-            + " (95 %)."
-        )
+        verdict = f"It is {' and '.join(decided)}" if decided else "The difference is not significant on any channel"
+        text += f", ray tracing {errors[referee.OURS]:.1f} dB on the same samples"
+        text += f" ({counted(len(common), 'channel')}). {verdict} (95 %)."
     else:
         text += ". Ray tracing has no score there."
     if np.isfinite(mean["rmse_db"]):
@@ -569,16 +559,17 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> dict
         return None
     same = near & (np.isfinite(level) | ~heard)
     name = given.path.name
+    absolute = given.unit in ("", item.unit) if given.quantity == "level_db" else item.unit == "dBm"
     # by model: its columns, whether it has the reference of the log, and the samples that it covers
-    models = {name: (predicted, given.absolute(item.unit), near)}
+    models = {name: (predicted, absolute, near)}
     if not item.training:  # its antennas were learned from these samples
         models[referee.OURS] = {"level": item.simulated_dbm}, item.unit == "dBm", same
     models |= {BASELINE_TITLE[key]: ({"level": of.level_dbm}, False, same) for key, of in item.baselines.items()}
     seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")
     thresholds = referee.measured_thresholds(item.measured_db[near], ratio=item.unit == "dB")
     cards = {
-        key: referee.level_card(seconds, item.measured_db, columns, on, thresholds, absolute=absolute)
-        for key, (columns, absolute, on) in models.items()
+        key: referee.level_card(seconds, item.measured_db, columns, on, thresholds, absolute=same_reference)
+        for key, (columns, same_reference, on) in models.items()
         if (np.isfinite(columns["level"]) & heard & on).sum() >= FEWEST
     }
     errors = {key: np.where(scored, item.measured_db - models[key][0]["level"], np.nan) for key in cards}
@@ -670,10 +661,8 @@ def _why_none(given: ForeignPrediction, data: FlightData, result: FlightResult) 
         return _other_time(given, result)
     above_m = given.table["height_m"].max() - data.site.takeoff_ground_m
     if above_m < _ON_GROUND_M:
-        return (
-            f"no predicted position is in the air (at most {above_m:.1f} m above the take-off ground), so an emulated "
-            "vehicle did not fly"
-        )
+        highest = f"at most {above_m:.1f} m above the take-off ground"
+        return f"no predicted position is in the air ({highest}), so an emulated vehicle did not fly"
     other = "a prediction of another route; --against-distance allows larger distances"
     return _wrong_heights(given, data, result) or other
 

@@ -206,12 +206,7 @@ def parsing(
         words = f"{type(error).__name__}: {one_line(str(error)[:200])}"
         # match the base class: UnicodeDecodeError is a UnicodeError
         words = next((text for kind, text in _IN_WORDS.items() if isinstance(error, kind)), words)
-        raise InputError(
-            f"cannot be read ({words})",
-            expected=expected,
-            cause=cause,
-            path=path,
-        ) from error
+        raise InputError(f"cannot be read ({words})", expected=expected, cause=cause, path=path) from error
 
 
 def _is_raised_here(error: BaseException) -> bool:

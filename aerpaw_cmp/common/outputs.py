@@ -717,9 +717,7 @@ def explained_os_errors(path: str | Path) -> Iterator[None]:
                 f"cannot be written ({error.strerror})", cause="a file is in the way, or a name too long", path=path
             ) from error
         raise OutputError(
-            f"cannot be written ({error.strerror or error})",
-            cause=_REMEDIES.get(error.errno or 0),
-            path=path,
+            f"cannot be written ({error.strerror or error})", cause=_REMEDIES.get(error.errno or 0), path=path
         ) from error
 
 

@@ -48,9 +48,7 @@ class FlightModem:
     """
 
     def __init__(
-        self,
-        rank: Callable[[float], int] | None = None,
-        rsrp: Callable[[float], float] | None = None,
+        self, rank: Callable[[float], int] | None = None, rsrp: Callable[[float], float] | None = None
     ) -> None:
         self._rank, self._rsrp = rank or flight_rank, rsrp or _flight_rsrp
         self.csi = [1, 1]

@@ -293,11 +293,7 @@ class BinnedCorrelation:
 
 
 def vector_correlation(
-    points_m: ArrayLike,
-    vectors: ArrayLike,
-    *,
-    width_m: float = _PAPER_WIDTH_M,
-    maximum_m: float = _PAPER_MAXIMUM_M,
+    points_m: ArrayLike, vectors: ArrayLike, *, width_m: float = _PAPER_WIDTH_M, maximum_m: float = _PAPER_MAXIMUM_M
 ) -> BinnedCorrelation:
     """Return the Pearson correlation of the vectors of two positions by distance (the paper's Steps 1 to 4).
 

@@ -364,12 +364,7 @@ def every_geometry(
 
 
 def singular_values_of(
-    geometries: Sequence[Geometry],
-    tower: Array,
-    tower_m: FloatArray,
-    uav: Array,
-    poses: Poses,
-    carrier_hz: float,
+    geometries: Sequence[Geometry], tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float
 ) -> Iterator[FloatArray]:
     """Yield the singular values (n, ports) of each geometry, in descending order.
 

@@ -229,13 +229,7 @@ class PathCache:
         self.folder = folder
         self.warnings: list[str] = []
 
-    def key(
-        self,
-        scene: Scene,
-        targets_m: FloatArray,
-        carrier_hz: float,
-        search: Search,
-    ) -> str:
+    def key(self, scene: Scene, targets_m: FloatArray, carrier_hz: float, search: Search) -> str:
         """Return the digest of everything that decides the paths.
 
         Parameters

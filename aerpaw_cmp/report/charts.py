@@ -112,10 +112,7 @@ def _detection(score: DetectionScore) -> dict[str, Any]:
     return {
         "x": {"label": "Predicted probability of detection [%]", "ends": [0, 100]},
         "y": {"label": "Detected samples [%]", "ends": [0, 100]},
-        "marks": [
-            mark("dots", "fifths of the samples", said, seen),
-            mark("line", "calibrated", ends, ends),
-        ],
+        "marks": [mark("dots", "fifths of the samples", said, seen), mark("line", "calibrated", ends, ends)],
     }
 
 

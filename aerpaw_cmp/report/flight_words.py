@@ -116,9 +116,7 @@ TOO_FEW_COMPARED = "Nothing could be compared: no channel has 20 samples with me
 
 
 def first_sentence(
-    scored: Sequence[tuple[float, int]],
-    baselines_db: Mapping[str, float],
-    verdicts: Sequence[Mapping[str, str]],
+    scored: Sequence[tuple[float, int]], baselines_db: Mapping[str, float], verdicts: Sequence[Mapping[str, str]]
 ) -> str:
     """Return the sentence about the error of ray tracing and of one baseline in all flights of a campaign.
 

@@ -298,12 +298,7 @@ class SiteModel(StrictModel):
     notes: list[str] = Field(default_factory=list)
 
 
-def load_site(
-    name_or_path: str | Path,
-    *,
-    coordinates: str | None = None,
-    tower_ground: Ground | None = None,
-) -> Site:
+def load_site(name_or_path: str | Path, *, coordinates: str | None = None, tower_ground: Ground | None = None) -> Site:
     """Return a packaged site by its name, or a site from a site.yaml.
 
     Parameters
@@ -654,14 +649,7 @@ def _outside(value: float, low: float, high: float) -> float:
     return max(low - value, value - high, 0.0)
 
 
-def _tower(
-    name: str,
-    model: TowerModel,
-    site: SiteModel,
-    frame: SiteFrame,
-    dem: Dem | None,
-    notes: list[str],
-) -> Tower:
+def _tower(name: str, model: TowerModel, site: SiteModel, frame: SiteFrame, dem: Dem | None, notes: list[str]) -> Tower:
     chosen = _chosen_position(name, model, site.coordinates, frame, notes)
     east, north = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
     ground = 0.0
@@ -799,11 +787,7 @@ def join_trees(parts: Sequence[Trees]) -> Trees:
 
 
 def place_trees(
-    forest: Forest,
-    sizes: TreeSizes = PAPER_SIZES,
-    *,
-    seed: int = 0,
-    keep_clear: BaseGeometry | None = None,
+    forest: Forest, sizes: TreeSizes = PAPER_SIZES, *, seed: int = 0, keep_clear: BaseGeometry | None = None
 ) -> Trees:
     """Return trees at random positions in a forest, with at least its minimum spacing.
 

@@ -84,12 +84,7 @@ class ExplainedPath:
 
 
 def explain_paths(
-    paths: PathSet,
-    faces: Faces,
-    source_m: FloatArray,
-    poses: Poses,
-    link: Link,
-    further_db: dict[str, FloatArray],
+    paths: PathSet, faces: Faces, source_m: FloatArray, poses: Poses, link: Link, further_db: dict[str, FloatArray]
 ) -> tuple[ExplainedPath, ...]:
     """Return the paths of one link, strongest first.
 

@@ -165,11 +165,7 @@ def foliage_model(
 
 
 def foliage_loss_db(
-    source_m: FloatArray,
-    vertices_m: FloatArray,
-    target_m: FloatArray,
-    trees: Trees | CrownIndex,
-    model: FoliageModel,
+    source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray, trees: Trees | CrownIndex, model: FoliageModel
 ) -> FloatArray:
     """Return the loss of each path in foliage [dB].
 

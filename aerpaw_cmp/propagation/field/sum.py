@@ -276,12 +276,7 @@ def fields_of(
 
 
 def channel_matrices(
-    paths: PathSet,
-    faces: Faces,
-    sources_m: FloatArray,
-    poses: Poses,
-    link: Link,
-    loss_db: FloatArray | None = None,
+    paths: PathSet, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
 ) -> Fields:
     """Return the channel matrices of a path set.
 

@@ -644,12 +644,7 @@ OVERLAP_M = 1e-3
 
 
 def find_paths(
-    faces: Faces,
-    links: Links,
-    run: Run = Run(),
-    *,
-    max_depth: int = 2,
-    extent_m: FloatArray | None = None,
+    faces: Faces, links: Links, run: Run = Run(), *, max_depth: int = 2, extent_m: FloatArray | None = None
 ) -> PathSet:
     """Find the same paths as :func:`.mirror.find_paths`, in scenes that have too many sequences for it.
 

@@ -201,10 +201,7 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
     # Sionna expects the conductivity [S/m], which it divides by omega eps0
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
-        f"m-{plain}",
-        thickness=thick,
-        relative_permittivity=float(eta.real),
-        conductivity=float(conductivity),
+        f"m-{plain}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
     )
 
 
@@ -268,12 +265,7 @@ class _Finder:
     """
 
     def __init__(
-        self,
-        built: _Scene,
-        sources: _Ends,
-        batch: int,
-        *,
-        patterns: tuple[str, str] = ("iso", "iso"),
+        self, built: _Scene, sources: _Ends, batch: int, *, patterns: tuple[str, str] = ("iso", "iso")
     ) -> None:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator

@@ -23,7 +23,7 @@ from typing import Any
 
 from ..logs.files import Record
 from .modem import RI_QUERY
-from .ports import STALE_S, TapStatus
+from .ports import TapStatus, stale_after_s
 
 # Number of rows that are stored: two hours at 10 Hz, ten hours at 2 Hz.
 ROWS = 72_000
@@ -118,7 +118,7 @@ class _Modem:
     @property
     def stale_s(self) -> float:
         """Age from which a measured value is not the present one [s]."""
-        return max(STALE_S, 3 * self.period_s)
+        return stale_after_s(self.period_s)
 
     def shown(self, now: float) -> dict[str, Any]:
         """Return the present values that the page shows, and the age of the rank. Old levels are None."""

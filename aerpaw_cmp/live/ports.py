@@ -547,12 +547,15 @@ def format_status(status: TapStatus) -> str:
     return "  ".join(parts)
 
 
-# Measured values older than this are not the present ones.
-STALE_S = 3.0
 # A slot that is late by at most this many periods is polled at once. Older slots are missed and counted.
 _CATCH_UP = 2
 # The first query is polled at most this many times in a row while another query is due.
 _IN_A_ROW = 3
+
+
+def stale_after_s(period_s: float) -> float:
+    """Return the age from which a measured value is not the present one [s], for a period of the rank query [s]."""
+    return max(3.0, 3 * period_s)
 
 
 class Schedule:

@@ -508,7 +508,7 @@ class Tap:
         name, status, decoded = record["query"], record["status"], record["decoded"]
         if name == modem.RI_QUERY:
             self._last["rank"] = decoded.get("rank")
-            if record["sent_mono_ns"] - self._level_ns > ports.STALE_S * 1e9:
+            if record["sent_mono_ns"] - self._level_ns > ports.stale_after_s(1 / self._settings.ri_hz) * 1e9:
                 self._last["rsrp_dbm"] = self._last["sinr_db"] = None
             if status == "ok":
                 self._ri_times.append(record["last_mono_ns"])

@@ -14,7 +14,7 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.log import Clock, LogSettings
 from aerpaw_cmp.live.modem import OTHER_QUERIES
-from aerpaw_cmp.live.ports import Schedule, TapSettings, TapStatus, format_status
+from aerpaw_cmp.live.ports import Schedule, TapSettings, TapStatus, format_status, stale_after_s
 from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
@@ -418,6 +418,11 @@ def test_a_modem_slower_than_the_rank_is_still_asked_for_its_levels():
     assert abs(counts["a"] - counts["b"]) <= 1
     assert counts["ri"] >= 120
     assert 196 <= counts["ri"] + missed["ri"] <= 200
+
+
+def test_a_value_is_old_after_three_seconds_or_three_slow_periods():
+    assert stale_after_s(0.5) == stale_after_s(1.0) == 3.0
+    assert stale_after_s(4.0) == 12.0
 
 
 def test_status_line():

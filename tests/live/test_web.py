@@ -16,7 +16,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.feed import CHUNK, MEASURED, Feed, Rows
-from aerpaw_cmp.live.ports import STALE_S, TapStatus
+from aerpaw_cmp.live.ports import TapStatus, stale_after_s
 from aerpaw_cmp.live.predict import RunningInterval
 from aerpaw_cmp.live.web import Address, Limits, WebServer
 from tests.live.terminals import until
@@ -446,7 +446,7 @@ def test_each_alarm_opens_and_closes():
     hand.answer(rank=1)
     assert hand.open() == []
     hand.put({"kind": "gap", "state": "open", "reason": "pulled", "mono_ns": hand.mono_ns})
-    hand.now_ns += int(2 * STALE_S * SECOND)
+    hand.now_ns += int(2 * stale_after_s(0.5) * SECOND)
     hand.feed.digest()
     assert hand.open() == ["gap"]  # and not that the rank is old, too
     hand.put({"kind": "gap", "state": "closed", "reason": "pulled", "mono_ns": hand.mono_ns})
@@ -510,7 +510,7 @@ def test_old_values_are_not_shown_as_present_ones():
     assert np.isnan(levels[6:]).all()
     hand.now_ns += 7 * SECOND
     shown = hand.feed.after("")[0]["modems"][0]
-    assert (shown["rank"], shown["rank_age_s"], shown["stale_s"]) == (2, 7.0, STALE_S)
+    assert (shown["rank"], shown["rank_age_s"], shown["stale_s"]) == (2, 7.0, 3.0)
     assert shown["rsrp_dbm"] is None
 
 

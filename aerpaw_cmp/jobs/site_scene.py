@@ -18,7 +18,7 @@ from ..common.geodesy import SiteFrame
 from ..common.outputs import OutputFile, OutputFolder, explained_os_errors, is_sealed, sealed
 from ..common.text import counted
 from ..site.antennas import read_gain_grid
-from ..site.footprints import name_and_value, numbers_of, site_yaml
+from ..site.footprints import name_and_value, numbers_of, numbers_of_towers, site_yaml
 from ..site.materials import CONSTANT, material
 from ..site.mitsuba import Mesh, TriangleScene
 from ..site.pattern_files import exported, read_cut_files, read_pattern_file
@@ -171,11 +171,7 @@ def _towers(towers: Sequence[str], frame: SiteFrame, low: Any, high: Any) -> dic
             cause=f"the scene reaches from {low[0]:.0f} to {high[0]:.0f} m east, {low[1]:.0f} to {high[1]:.0f} m north",
         )
     by_name: dict[str, Any] = {}
-    for text in towers:
-        name, place = name_and_value(text, "--tower", "BS=10,20,25")
-        east, north, up = numbers_of(place, (3,), f"--tower {name}", "--tower name=east,north,height")
-        if name in by_name:
-            raise UsageError(f"--tower '{text}'", expected="another name", cause=f"two towers named '{name}'")
+    for name, (east, north, up) in numbers_of_towers(towers, "NAME=EAST,NORTH,HEIGHT, such as BS=10,20,25").items():
         latitude, longitude = frame.to_geographic(east, north)
         by_name[name] = {
             "latitude_deg": round(float(latitude), 10),

@@ -701,8 +701,7 @@ def import_site(
         content, area_m = model.model_dump(), extent_m(model, frame)
         if model.dem is not None:  # the new file may be in another folder
             content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
-    if towers:
-        content["towers"] = named_towers
+    content |= {"towers": named_towers} if towers else {}
     if dem is not None:
         content |= {"dem": {"path": str(Path(dem).resolve()), "crs": dem_crs}, "tower_ground": None}
     imports = import_footprints(files, frame, area_m=area_m, **options)
@@ -783,20 +782,28 @@ def numbers_of(text: str, counts: tuple[int, ...], what: str, expected: str) -> 
     return values
 
 
+def numbers_of_towers(towers: Sequence[str], form: str) -> dict[str, list[float]]:
+    """Return the three numbers of each ``NAME=A,B,C`` of ``--tower`` by name. UsageError if two have one name."""
+    by_name: dict[str, list[float]] = {}
+    for text in towers:
+        name, place = name_and_value(text, "--tower", form)
+        if name in by_name:
+            raise UsageError(f"--tower '{text}'", expected="another name", cause=f"two towers named '{name}'")
+        by_name[name] = numbers_of(place, (3,), f"--tower {name}", f"--tower {form}")
+    return by_name
+
+
 def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return towers by name from ``NAME=LATITUDE,LONGITUDE,HEIGHT``."""
     form = "NAME=LATITUDE,LONGITUDE,HEIGHT, such as --tower roof=40.009,-105.267,25 [deg, deg, m above ground]"
     by_name: dict[str, dict[str, float]] = {}
-    for text in towers:
-        name, place = name_and_value(text, "--tower", form)
-        latitude, longitude, height = numbers_of(place, (3,), f"--tower {name}", f"--tower {form}")
-        for wrong, cause in (
-            (not 0 < height <= TALLEST_M, f"a height outside 0 to {TALLEST_M:g} m"),
-            (not (abs(latitude) <= 90 and abs(longitude) <= 180), "longitude before latitude, or not in degrees"),
-            (name in by_name, f"two towers named '{name}'"),
-        ):
-            if wrong:
-                raise UsageError(f"--tower '{text}'", expected=f"--tower {form}", cause=cause)
+    for name, (latitude, longitude, height) in numbers_of_towers(towers, form).items():
+        cause = "longitude before latitude, or not in degrees" if abs(latitude) > 90 or abs(longitude) > 180 else None
+        if not 0 < height <= TALLEST_M:
+            cause = f"a height outside 0 to {TALLEST_M:g} m"
+        if cause is not None:
+            found = f"--tower {name} at {latitude:g}, {longitude:g}, {height:g} m"
+            raise UsageError(found, expected=f"--tower {form}", cause=cause)
         by_name[name] = {"latitude_deg": latitude, "longitude_deg": longitude, "antenna_height_m": height}
     return by_name
 

@@ -158,8 +158,9 @@ def time_correlations(terms: int = TERMS) -> CorrelationSet:
     white = np.eye(terms + 1)
     covariances = [
         (1.0 - share) * 0.5 * rate * _exponential(rate, terms).real + share * white
-        for share in WHITE_SHARES for rate in RATES
-    ] + [0.25 * rate * _smooth(rate, terms) + _SMOOTH_FLOOR * white for rate in RATES]  # fmt: skip
+        for share in WHITE_SHARES
+        for rate in RATES
+    ] + [0.25 * rate * _smooth(rate, terms) + _SMOOTH_FLOOR * white for rate in RATES]
     return CorrelationSet.of(np.array(covariances))
 
 

@@ -675,9 +675,10 @@ def _undated(data: FlightData, track: str) -> list[str]:
     return [
         log.path
         for log, file in zip(data.settings.logs, data.files, strict=True)
-        if log.path in dated and track not in dated
+        if log.path in dated
+        and track not in dated
         and any(s.kind != "telemetry" and "latitude_deg" in s.frame for s in file.result.streams)
-    ]  # fmt: skip
+    ]
 
 
 def _times_on_track(data: FlightData) -> list[tuple[str, Times]]:
@@ -718,12 +719,14 @@ def _of_carriers(links: LinksSettings, log: LogSettings, streams: Sequence[Strea
     """Return remarks about levels whose frequency differs from the carrier of their link."""
     carriers = [
         (s.name, float(s.attributes["frequency_hz"]), links.of(_channel_of(log, s)).carrier_hz)
-        for s in streams if s.kind == "rss" and isinstance(s.attributes.get("frequency_hz"), float)
-    ]  # fmt: skip
+        for s in streams
+        if s.kind == "rss" and isinstance(s.attributes.get("frequency_hz"), float)
+    ]
     return [
         f"{name!r} was measured at {log_hz / 1e6:g} MHz and is replayed at carrier_hz {hz / 1e6:g} MHz"
-        for name, log_hz, hz in carriers if abs(log_hz / hz - 1.0) > _CARRIER_SHARE
-    ]  # fmt: skip
+        for name, log_hz, hz in carriers
+        if abs(log_hz / hz - 1.0) > _CARRIER_SHARE
+    ]
 
 
 # Relative difference of carriers at which free space differs by 0.4 dB.

@@ -158,9 +158,11 @@ def replay_rss(
         times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
         valid, places, tracks = _towers_and_poses(data, tower, times)
         poses = [valid_poses(track, data.settings.rss_attitude) for track in tracks]
-        joined = poses[0] if len(poses) == 1 else Poses(
-            np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses])
-        )  # fmt: skip
+        joined = (
+            poses[0]
+            if len(poses) == 1
+            else Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
+        )
         channels = ", ".join(data.rss[i].channel for i in members)
         progress(f"replay RSS {tower} {channels}: {counted(len(joined), 'pose')}")
         towers_m = None if tower not in data.nodes else np.concatenate(places)

@@ -216,14 +216,15 @@ def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -
     """Return the expected link of flight.yaml."""
     wavelength = reference.C_MPS / settings.carrier_hz
     return reference.ExpectedLink(
-        carrier_hz=settings.carrier_hz, transmit_power_dbm=settings.transmit_power_dbm,
+        carrier_hz=settings.carrier_hz,
+        transmit_power_dbm=settings.transmit_power_dbm,
         uav_transmits=settings.uav_transmits,
         towers={name: expected_array(settings.towers.get(name, settings.tower), wavelength, folder) for name in towers},
         uav=expected_array(settings.uav, wavelength, folder),
         # k T B at 290 K
         noise_floor_dbm=10 * math.log10(1.380649e-23 * 290 * (settings.bandwidth_hz or 1.0) * 1e3)
         + (settings.noise_figure_db or 0.0),
-    )  # fmt: skip
+    )
 
 
 def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> reference.ExpectedArray:

@@ -151,7 +151,8 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
         "samples": search.samples if sionna else None,
         "arrays": "float64",
         "depth": search.max_depth,
-        "missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths,
+        "missing_paths": difference.missing_paths,
+        "extra_paths": difference.extra_paths,
         "coverage_differs": difference.coverage_differs,
         **{name: value if np.isfinite(value) else None for name, value in errors.items()},
         "seconds": seconds,
@@ -159,7 +160,7 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
         "peak_mib": peak_mib(),
         "rank_disagreement": {f"{k:g}": share for k, share in difference.rank_disagreement.items()},
         "links_per_s": len(poses) * len(link.tower_arrays) / max(seconds, 1e-9),
-    }  # fmt: skip
+    }
 
 
 # --- comparison with peers --------------------------------------------------------------------------------------------

@@ -208,7 +208,9 @@ def _record_of(
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
-        trained_on=calibration.trained_on, marks=calibration.marks, words=calibration.words,
+        trained_on=calibration.trained_on,
+        marks=calibration.marks,
+        words=calibration.words,
         warnings=calibration.warnings,
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
@@ -217,7 +219,7 @@ def _record_of(
         antennas=tuple(maps.values()),
         settings_text=text,
         stages_s=stages_s,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -296,7 +296,8 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     wild = rss.outliers(levels.measured_db)
     detection = None if case.trained else _detection(case)
     further = records.RssFurther(
-        n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out,
+        n_measured_out=score.n_measured_out,
+        n_simulated_out=score.n_simulated_out,
         n_too_low=int((replayed.valid & ~levels.posed).sum()),
         n_no_pose=int((~replayed.valid).sum()),
         n_outliers=int(wild.sum()),
@@ -312,7 +313,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
         trained_on=case.trained or None,
         rmse_bound=_bound(series, score),
         interval_notes=score.intervals.notes or None,
-    )  # fmt: skip
+    )
     if case.trained:
         return further
     return dataclasses.replace(

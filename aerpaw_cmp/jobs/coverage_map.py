@@ -753,9 +753,10 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
             continue
         study = outcome.studies[key]
         result.setdefault("correlation", {})[f"z_{key}"] = {
-            **asdict(study.fit), "positions": study.correlation.positions,
+            **asdict(study.fit),
+            "positions": study.correlation.positions,
             "excluded_constant": study.correlation.excluded_constant,
-        }  # fmt: skip
+        }
     return result
 
 

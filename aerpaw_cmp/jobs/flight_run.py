@@ -101,8 +101,10 @@ class Model:
     def name(self) -> str:
         """The parts of the model as text."""
         parts = {
-            "isotropic": [], "measured": ["antennas"], "learned": ["learned antennas"],
-        }[self.antennas]  # fmt: skip
+            "isotropic": [],
+            "measured": ["antennas"],
+            "learned": ["learned antennas"],
+        }[self.antennas]
         parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
         if self.ground != "none":
             parts.append(f"{_GROUND_WORDS[self.ground]} ground reflection")

@@ -124,8 +124,9 @@ def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -
     texts = [f"{caution.key}: {caution.text}." for caution in own]
     texts += [
         f"antennas.{key} is not used: the node is unknown here; link.rss.tower describes its antenna."
-        for key in settings.antennas if key.endswith(f".{channel}")
-    ]  # fmt: skip
+        for key in settings.antennas
+        if key.endswith(f".{channel}")
+    ]
     used = settings.link.of(channel).uav.antenna.file
     if "uav" in settings.antennas and (uav is None or used is None or uav.name not in used):
         texts.append("antennas.uav is not used: it was learned from this log.")

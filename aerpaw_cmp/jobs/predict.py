@@ -376,10 +376,12 @@ def _bases(
         if name in sources and abs(memory.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
     }
     learned: dict[str, list[MeasuredPattern | FlightFile]] = {
-        "replay": [*(p for link, folder in links for p in learned_patterns(link, folder, place)),
-                   *(data.settings for data in known)],
+        "replay": [
+            *(p for link, folder in links for p in learned_patterns(link, folder, place)),
+            *(data.settings for data in known),
+        ],
         "memory": [end for memory in near.values() for end in (memory.tower, memory.uav)],
-    }  # fmt: skip
+    }
     if not any(knows(data, learned["replay"]) for data in known):
         bases["replay"] = each(lambda source, s: source.replayed_db(s))
     if len(near) == len(sources) and not any(knows(data, learned["memory"]) for data in known):

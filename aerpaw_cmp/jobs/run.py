@@ -307,8 +307,10 @@ def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
     learned = None if chosen.learned is None else Path(chosen.learned)
     settings = _with_audit(load_with_learned(flight, learned), chosen.audit)
     inputs = [
-        *inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned]), *chosen.against
-    ]  # fmt: skip
+        *inputs_of_flight(settings, flight, options.logs_root),
+        *([] if learned is None else [learned]),
+        *chosen.against,
+    ]
     return settings, inputs, options.out or Path("reports") / settings.flight.name
 
 

@@ -106,9 +106,11 @@ class Grid:
         """The extent of the cells ``(east_min, east_max, north_min, north_max)``."""
         half = self.spacing_m / 2
         return (
-            float(self.east_m[0] - half), float(self.east_m[-1] + half),
-            float(self.north_m[0] - half), float(self.north_m[-1] + half),
-        )  # fmt: skip
+            float(self.east_m[0] - half),
+            float(self.east_m[-1] + half),
+            float(self.north_m[0] - half),
+            float(self.north_m[-1] + half),
+        )
 
     def __len__(self) -> int:
         return len(self.east_m) * len(self.north_m)

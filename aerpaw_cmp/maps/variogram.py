@@ -216,11 +216,11 @@ class _Projection:
             "one of the two exponentials has no amplitude": min(c1, c3) <= 1e-3 * max(c1, c3),
             # two rates within 5 % represent a single exponential
             "both exponentials decay at the same rate": log_rates[0] - log_rates[1] < 0.05,
-            "the faster decay ends before the first distance, so its rate cannot be determined":
-                log_rates[0] > self.log_rates[1] - 1e-3,
-            "the slower decay does not show within the largest distance":
-                np.exp(log_rates[1]) * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3,
-        }  # fmt: skip
+            "the faster decay ends before the first distance, so its rate cannot be determined": log_rates[0]
+            > self.log_rates[1] - 1e-3,
+            "the slower decay does not show within the largest distance": np.exp(log_rates[1]) * self.d.max() < 1e-3
+            or log_rates[1] < self.log_rates[0] + 1e-3,
+        }
         return self.curve(log_rates, [text for text, applies in reasons.items() if applies])
 
 

@@ -233,7 +233,7 @@ def scores_card(data: CalibrationData) -> Card:
         "it could not be held out. Controls are the same fit in a wrong frame, and without measured patterns.",
         columns={"Held out": HEAD, **each, **baselines, "channels": 0},
         rows=[(SPLIT_TITLE.get(name, name), *(_mean(of, key) for key in keys), len(of)) for name, of in rows.items()],
-    )  # fmt: skip
+    )
     every = Table(
         caption="RMSE in dB after the flight's own offset; \"offset of the training flights\": with their mean offset.",
         columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "Channel": TEXT, **each,

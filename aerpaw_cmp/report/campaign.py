@@ -631,9 +631,10 @@ def failures_card(data: CampaignData) -> Card:
     """Return the card of flights and settings without numbers."""
     table = Table(
         caption=f"Flights and settings without numbers{more(data.failures, ROWS_SHOWN)}.",
-        columns={"Flight": HEAD, "Setting": TEXT, "Why": TEXT}, look="tall",
+        columns={"Flight": HEAD, "Setting": TEXT, "Why": TEXT},
+        look="tall",
         rows=[(f.flight, f.setting, f.message) for f in data.failures[:ROWS_SHOWN]],
-    )  # fmt: skip
+    )
     return Card(title="Failures", id="failures", link="Failures", tables=[table])
 
 

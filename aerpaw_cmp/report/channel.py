@@ -256,7 +256,8 @@ def write_channel(
                 files = [write(latest, folder) for write in writers]
     return files, {
         "flight": latest.along.name,
-        "link": latest.link, "carrier_hz": latest.carrier_hz,
+        "link": latest.link,
+        "carrier_hz": latest.carrier_hz,
         "towers": list(latest.replay.towers),
         "poses": poses,
         "paths": paths,
@@ -264,7 +265,7 @@ def write_channel(
         "has_level": latest.level_db is not None,
         KEY: list(latest.trained_on),
         "warnings": latest.warnings,
-    }  # fmt: skip
+    }
 
 
 @contextmanager
@@ -294,8 +295,9 @@ def _arrays(channel: Channel) -> dict[str, Any]:
         "towers": np.array(channel.replay.towers),
         "carrier_hz": channel.carrier_hz,
         "doppler_hz": channel.by_link(channel.doppler_hz),
-        "level_db": channel.level_db, "level_sd_db": channel.level_sd_db,
-    }  # fmt: skip
+        "level_db": channel.level_db,
+        "level_sd_db": channel.level_sd_db,
+    }
     return {name: values for name, values in arrays.items() if values is not None}
 
 

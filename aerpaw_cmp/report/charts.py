@@ -96,8 +96,9 @@ def charts_of(data: ReportData) -> list[Chart]:
 def _errors(models: Sequence[ModelRow]) -> dict[str, Any]:
     """Return a chart with one row per model: its RMSE on held-out areas."""
     of = [(i, row) for i, row in enumerate(models) if np.isfinite(row.rmse_heldout_db)]
-    rmse, apart = (np.array([getattr(row, key) for _, row in of])
-                   for key in ("rmse_heldout_db", "difference_to_best_db"))  # fmt: skip
+    rmse, apart = (
+        np.array([getattr(row, key) for _, row in of]) for key in ("rmse_heldout_db", "difference_to_best_db")
+    )
     low, high = np.array([row.difference_to_best_ci95_db for _, row in of]).T + rmse - apart
     dots = mark("dots", "RMSE, all channels", rmse, np.array([float(i) for i, _ in of]), low=low, high=high)
     names = [f"{number}  {row.model}" for number, row in enumerate(models, 1)]

@@ -101,10 +101,12 @@ def clock_metrics(clock: results.ClockResult) -> dict[str, Any]:
     """Return the entry ``clock.<receiver>`` of metrics.json: numbers, verdict, whether it was applied, and checks."""
     return {
         **clock.checks,
-        "radio_minus_telemetry_s": clock.radio_minus_telemetry_s, "ci95_s": clock.ci95_s, "verdict": clock.verdict,
+        "radio_minus_telemetry_s": clock.radio_minus_telemetry_s,
+        "ci95_s": clock.ci95_s,
+        "verdict": clock.verdict,
         "reason": clock.reason,
         "applied": clock.applied in (results.APPLIED, results.GIVEN),
-    }  # fmt: skip
+    }
 
 
 def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, Any]:
@@ -346,8 +348,10 @@ def models_card(data: ReportData) -> Card:
     rows = {(row.model, row.tower, row.channel): row for row in data.ladder}
     channels = dict.fromkeys((row.tower, row.channel) for row in data.ladder)
     shown, same = [row for row in data.models if row.distinct], [row.model for row in data.models if not row.distinct]
-    notes = {row.model: ", ".join(["recommended"] * row.recommended + ["fastest sufficient"] * row.fastest_sufficient)
-             for row in shown}  # fmt: skip
+    notes = {
+        row.model: ", ".join(["recommended"] * row.recommended + ["fastest sufficient"] * row.fastest_sufficient)
+        for row in shown
+    }
     pooled = Table(
         caption="RMSE on held-out areas over all channels, and its difference from the best model on the same "
         "samples, with its 95 % interval.",
@@ -396,14 +400,15 @@ def serving_card(data: ReportData) -> Card:
         "the most samples. Simulated levels have no offset.",
         columns={"Served": HEAD, **dict.fromkeys(names, 0), "no path": 0},
         rows=[(name, *row.tolist()) for name, row in zip(names, counts, strict=True)],
-    )  # fmt: skip
+    )
     text = paragraph(
-        "The cell that is predicted to be the strongest served in", bold(percent(serving.hit_share, 1)),
+        "The cell that is predicted to be the strongest served in",
+        bold(percent(serving.hit_share, 1)),
         f"of {number(serving.n, 0)} samples; always predicting the most frequent serving cell is right in "
         f"{percent(serving.majority_share, 1)}.",
         "The prediction is no better than that." if serving.hit_share <= serving.majority_share else "",
         "The complete matrix is in metrics.json, key serving.",
-    )  # fmt: skip
+    )
     return Card(title="Serving cells", id="serving", link="Serving cells", fold=True, text=[text], tables=[table])
 
 
@@ -479,19 +484,23 @@ def inputs_card(data: ReportData) -> Card:
         caption="Every line is accepted, rejected with a reason, or blank. Comments and headers count as blank.",
         columns={"File": HEAD, "Reader": TEXT, "Lines": 0, "Accepted": 0, "Rejected": 0, "Blank": 0, "SHA-256": "hash"},
         rows=[
-            (Markup('{} <span class="small">{}</span>').format(f.path, f"({f.role})" if f.role else ""),
-             *((f.reader, f.lines, f.accepted, f.rejected, f.blank) if f.reader else ("not a log", "", "", "", "")),
-             Markup('<span title="{}">{}…</span>').format(f.sha256, f.sha256[:16]))
+            (
+                Markup('{} <span class="small">{}</span>').format(f.path, f"({f.role})" if f.role else ""),
+                *((f.reader, f.lines, f.accepted, f.rejected, f.blank) if f.reader else ("not a log", "", "", "", "")),
+                Markup('<span title="{}">{}…</span>').format(f.sha256, f.sha256[:16]),
+            )
             for f in data.inputs
         ],
-    )  # fmt: skip
+    )
     parts = [
         Card(
             title=f"{f.path}: {counted(f.rejected, 'rejected line')}, {counted(len(f.warnings), 'remark')}",
-            fold=not f.warnings, text=[f.warnings], tables=[_rejected(f)],
+            fold=not f.warnings,
+            text=[f.warnings],
+            tables=[_rejected(f)],
         )
         for f in data.inputs
-    ]  # fmt: skip
+    ]
     text = [] if data.inputs else ["No input file was named."]
     title = "Inputs and their account"
     return Card(title=title, id="inputs", link="Inputs", fold=True, text=text, tables=[table], parts=parts)

@@ -483,8 +483,9 @@ def offset_sentences(panels: Sequence[RssResult]) -> list[str]:
     known = lists_by_key((unit, of) for unit, of in offsets if of < 0.0 or of >= _LARGE_OFFSET_DB)
     return [
         f"Offset {' to '.join(dict.fromkeys(signed(end) for end in (min(of), max(of))))} dB: {OFFSETS[unit]}."
-        for unit, of in known.items() if unit in OFFSETS
-    ]  # fmt: skip
+        for unit, of in known.items()
+        if unit in OFFSETS
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -48,10 +48,11 @@ def write_locate(
     table = Table(
         caption="Parts of the 90 % region. Nine tenths of a part are within the stated distance of its position.",
         columns={"Position": HEAD, "East [m]": 0, "North [m]": 0, "Share": SHARE, "Within [m]": 0},
-        rows=[(f"{m['latitude_deg']:.7f}, {m['longitude_deg']:.7f}", m["east_m"], m["north_m"], m["share"],
-               m["radius_m"])
-              for m in numbers["modes"]],
-    )  # fmt: skip
+        rows=[
+            (f"{m['latitude_deg']:.7f}, {m['longitude_deg']:.7f}", m["east_m"], m["north_m"], m["share"], m["radius_m"])
+            for m in numbers["modes"]
+        ],
+    )
     page = Page(
         kind="locate", title=f"Ground node of {numbers['flight']}, {numbers['channel']}", verdict=numbers["sentence"],
         cautions=numbers["warnings"], about=[f"Made {minute(numbers['generated'])}."],

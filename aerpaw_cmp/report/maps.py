@@ -444,10 +444,11 @@ class Plate:
     def charts(self) -> list[Chart]:
         """The charts of the page."""
         return [
-            Chart(section=self.section, title=f"{self.title}: {name}", content=content,
-                  caption="" if i else self.caption)
+            Chart(
+                section=self.section, title=f"{self.title}: {name}", content=content, caption="" if i else self.caption
+            )
             for i, (name, content) in enumerate(self.panels.items())
-        ]  # fmt: skip
+        ]
 
 
 def plates(data: MapsData) -> Iterator[Plate]:
@@ -467,12 +468,13 @@ def plates(data: MapsData) -> Iterator[Plate]:
         )  # fmt: skip
     for tower, ranks in grouped(data.corrected_rank, lambda m: m.tower).items():
         yield Plate(
-            name=f"rank_share_learned_{safe_name(tower)}", section="rank",
+            name=f"rank_share_learned_{safe_name(tower)}",
+            section="rank",
             title=f"Rank of {tower} against height, raw and corrected",
             caption="Raw: share of positions with each rank of the traced channel, by K, and out of coverage. Learned "
             "receiver: mean probability of each rank.",
             panels={source: rank_shares(some) for source, some in grouped(ranks, lambda m: m.source).items()},
-        )  # fmt: skip
+        )
     if data.correlation:
         yield Plate(
             name="correlation", section="kriging", title="Spatial correlation",
@@ -716,7 +718,7 @@ def result_card(data: MapsData) -> Card:
         caption="What the paper (arXiv 2502.10324) states, and the results of this run.",
         columns={"Where": HEAD, "What": TEXT, "Paper": TEXT, "Here": TEXT, "Figure": TEXT},
         rows=[(p.where, p.what, p.paper, p.ours, p.figure) for p in data.paper],
-    )  # fmt: skip
+    )
     return Card(title="Result", id="result", link="Result", tables=[coverage_table(data), paper])
 
 
@@ -766,8 +768,9 @@ def error_table(errors: Sequence[MapError]) -> Table:
         rows.append((*key, *(finite_mean([e.mae for e in members if e.k == k]) for k in ks)))
     return Table(
         caption="Mean absolute error of the interpolated rank, mean over heights.",
-        columns={"Evaluation": TEXT, "Method": HEAD, **{f"K = {k_key(k)}": 3 for k in ks}}, rows=rows,
-    )  # fmt: skip
+        columns={"Evaluation": TEXT, "Method": HEAD, **{f"K = {k_key(k)}": 3 for k in ks}},
+        rows=rows,
+    )
 
 
 # Cards in the order of the page. A new card is another function here.

@@ -81,7 +81,7 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
         caption="Expected standard deviation by flight time, after the best of three candidates of that length.",
         columns={"Time [min]": 1, "Length [km]": 1, "SD [dB]": 1},
         rows=[(p["minutes"], p["length_m"] / 1000, p["sd_db"]) for p in data.curve],
-    )  # fmt: skip
+    )
     target = data.target if data.seen_from_m is None else "all directions around the towers, at all headings"
     known = f"Known flights: {', '.join(data.flights)}."
     if not data.flights:

@@ -327,7 +327,7 @@ def _levels_card(numbers: Mapping[str, Any], *, lock: bool, flown: bool) -> Card
         caption="Mean probability of each rank over all points, by the learned receiver.",
         columns={"Tower": HEAD, **{f"rank {rank}": 2 for rank in RANKS}},
         rows=[(tower, *share.values()) for tower, share in numbers["ranks"].items()],
-    )  # fmt: skip
+    )
     return Card(title="Levels", id="series", tables=[levels, ranks])
 
 
@@ -341,15 +341,17 @@ def _model_card(data: PredictionPage) -> Card:
         return Card(title="Model", id="model", text=[text])
     errors = Table(
         caption=f"Errors of 4 s means on held-out {data.chosen['left_out']} [dB], without the mean of each flight.",
-        columns={"Model": HEAD, "Residual field": TEXT, "RMSE": 2, "CRPS": 3}, look="dense",
+        columns={"Model": HEAD, "Residual field": TEXT, "RMSE": 2, "CRPS": 3},
+        look="dense",
         rows=[(row["base"], row["field"], row["rmse_db"], row["crps_db"]) for row in data.candidates],
-    )  # fmt: skip
+    )
     scales = Table(caption="Fitted values.", columns={"Name": HEAD, "Value": 2}, rows=list(data.model.items()))
     text = paragraph(
-        "Selected by errors on held-out parts of the named flights:", Markup("{}.").format(chosen),
+        "Selected by errors on held-out parts of the named flights:",
+        Markup("{}.").format(chosen),
         f"Standard deviations are multiplied by {number(data.chosen['sd_factor'], 2)}, the ratio of observed to stated "
         "errors on these parts.",
-    )  # fmt: skip
+    )
     parts = [Card(title="Residual field: strengths and scales", fold=True, tables=[scales])]
     return Card(title="Model", id="model", text=[text], tables=[errors], parts=parts)
 

@@ -301,9 +301,11 @@ _FOREIGN = (
     (r"(?s).{0,200}?Freq\w*\s*\d+\s*\n.{0,200}?rETheta", "a far field of HFSS: save gain in dBi as a sphere CSV"),
     (r"(?s)\s*(<\?xml|<antenna)", "an antenna in XML: save it as MSI Planet"),
     (r"\s*(azimuth|elevation|theta)_deg", "one of two cuts: name the other file with 'elevation'"),
-    (r"[^\n]*(?i:angle|azimuth|elevation|theta|phi)[^\n]*,", "one of two cuts (name the other file "
-     "with 'elevation'), or a table with unknown column names"),
-)  # fmt: skip
+    (
+        r"[^\n]*(?i:angle|azimuth|elevation|theta|phi)[^\n]*,",
+        "one of two cuts (name the other file with 'elevation'), or a table with unknown column names",
+    ),
+)
 
 
 _FREQUENCY = re.compile(

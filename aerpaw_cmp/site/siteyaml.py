@@ -557,9 +557,11 @@ def ground_surface(model: SiteModel, frame: SiteFrame) -> Surface:
     east, north = _tower_places(model, frame)
     area = extent_m(model, frame)
     reach = (
-        min(area[0], east.min()) - _SURFACE_MARGIN_M, max(area[1], east.max()) + _SURFACE_MARGIN_M,
-        min(area[2], north.min()) - _SURFACE_MARGIN_M, max(area[3], north.max()) + _SURFACE_MARGIN_M,
-    )  # fmt: skip
+        min(area[0], east.min()) - _SURFACE_MARGIN_M,
+        max(area[1], east.max()) + _SURFACE_MARGIN_M,
+        min(area[2], north.min()) - _SURFACE_MARGIN_M,
+        max(area[3], north.max()) + _SURFACE_MARGIN_M,
+    )
     return surface_through(points, frame, reach)
 
 

@@ -14,10 +14,11 @@ from ..app import Flights, command, of_run
 from ..shown import answered, print_files, records, show, warn_all
 
 _HEIGHT = Option(
-    min=0.1, max=10_000.0,
+    min=0.1,
+    max=10_000.0,
     help="Height [m] of a grid, of the tool's own routes, and of route points without a height; repeatable  "
     "[default: 40]",
-)  # fmt: skip
+)
 
 
 @command(

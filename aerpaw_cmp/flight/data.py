@@ -32,7 +32,7 @@ from ..logs.records import COLUMNS, Stream
 from ..propagation.geometry import Link
 from ..site.learned import read_learned
 from ..site.site import Site, Tower
-from ..site.siteyaml import load_site
+from ..site.siteyaml import load_site, misread
 from .clock import clock_trap
 from .cross_checks import check_heights, doubts
 from .rows import FLAG, frozen, lock_of, scored_rows, unscored, without_values
@@ -772,14 +772,7 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
     latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
     if not (near := nearest_m(site, latitude, longitude)) > FAR_M:
         return
-    # most frequent mistakes first
-    turned = {
-        "latitude and longitude are swapped": (longitude, latitude),
-        "the sign of the longitude is missing (west is negative)": (latitude, -longitude),
-        "the sign of the latitude is missing (south is negative)": (-latitude, longitude),
-        "latitude and longitude are swapped and a sign is missing": (longitude, -latitude),
-    }
-    causes = [why for why, angles in turned.items() if nearest_m(site, *angles) <= FAR_M]
+    causes = [why for why, angles in misread(latitude, longitude).items() if nearest_m(site, *angles) <= FAR_M]
     raise InputError(
         f"the positions are at least {near / 1000.0:.0f} km from every tower of site {site.name!r}",
         expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",

@@ -596,13 +596,19 @@ def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
         )
 
 
+def misread(latitude: Any, longitude: Any) -> dict[str, tuple[Any, Any]]:
+    """Return what a wrong position can have meant by its likely error, the most frequent error first."""
+    return {
+        "latitude and longitude are swapped": (longitude, latitude),
+        "the sign of the longitude is wrong: west is negative": (latitude, -longitude),
+        "the sign of the latitude is wrong: south is negative": (-latitude, longitude),
+        "latitude and longitude are swapped and a sign is wrong": (longitude, -latitude),
+    }
+
+
 def why_far(latitude: float, longitude: float, frame: SiteFrame) -> str:
     """Return the likely error of a position that is far from the site."""
-    for cause, position in (
-        ("latitude and longitude are swapped", (longitude, latitude)),
-        ("the sign of the longitude is wrong: west is negative", (latitude, -longitude)),
-        ("the sign of the latitude is wrong: south is negative", (-latitude, longitude)),
-    ):
+    for cause, position in misread(latitude, longitude).items():
         # a latitude can become invalid when both are swapped
         if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= _FAR_TOWER_M:
             return cause

@@ -395,7 +395,7 @@ def test_one_absurd_level_changes_no_number_and_is_told(
     ("written", "instead", "words"),
     [
         ("t,lat,lon", "t,lon,lat", r"at least \d+ km from every tower.*latitude and longitude are swapped"),
-        (",-78.", ",78.", "the sign of the longitude is missing"),
+        (",-78.", ",78.", "the sign of the longitude is wrong: west is negative"),
         (",35.", ",36.", r"at least 1\d\d km from every tower.*another site"),
     ],
 )

@@ -174,6 +174,7 @@ SQUARE = "[[0, 0], [10, 0], [10, 10], [0, 10]]"
         ("buildings:\n  - {name: b, height_m: 4, polygon_m: [[0, 0], [.nan, 0], [10, 10]]}", 6, "a finite number"),
         (f"forests:\n  - {{name: w, trees_per_hectare: 1e9, polygon_m: {SQUARE}}}", 6, "at most 2000000"),
         ("  U: {latitude_deg: -78.696, longitude_deg: 35.7275}", 5, "latitude and longitude are swapped"),
+        ("  U: {latitude_deg: 78.696, longitude_deg: 35.7275}", 5, "are swapped and a sign is wrong"),
         ("  U: {latitude_deg: 35.7275, longitude_deg: 78.696}", 5, "west is negative"),
         ("  U: {latitude_deg: 35.9, longitude_deg: -78.696}", 5, "a digit is wrong"),
         ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna_height_m: 3300}", 5, "feet or centimetres"),

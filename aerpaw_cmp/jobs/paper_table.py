@@ -112,10 +112,9 @@ def _rank(result: Any) -> dict[str, str]:
     towers = result.towers_m[result.serving, :2]
     near = np.hypot(*(result.grid.points_m - towers).T) <= NEAR_M
     ranks = result.ranks()
-    inside, outside = (
-        _by_k(result.ks, [_share_above_one(ranks[:, k][:, some]) for k in range(len(result.ks))])
-        for some in (near, ~near)
-    )
+    # the share of ranks above 1 among the covered positions
+    parts = ([ranks[:, k][:, some] for k in range(len(result.ks))] for some in (near, ~near))
+    inside, outside = (_by_k(result.ks, [(r > 1).sum() / max((r > 0).sum(), 1) for r in part]) for part in parts)
     ours = {
         "rank_1": _by_k(result.ks, shares[:, :, 1].sum(axis=0) / covered),
         "rank_1_or_2": _by_k(result.ks, shares[:, :, 1:3].sum(axis=(0, 2)) / covered),
@@ -124,10 +123,6 @@ def _rank(result: Any) -> dict[str, str]:
     if 3.0 in result.rank_altitudes_m:
         ours["uncovered_3m"] = _percent(shares[result.rank_altitudes_m.index(3.0), 0, 0])
     return ours
-
-
-def _share_above_one(ranks: Any) -> float:
-    return float((ranks > 1).sum() / max(int((ranks > 0).sum()), 1))
 
 
 def _by_k(ks: Any, values: Any, form: str = "") -> str:

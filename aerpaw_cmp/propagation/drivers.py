@@ -280,12 +280,8 @@ def _scene_of(
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     """Return the replay of a block as a replay of one tower, which had a separate position at each pose."""
-    row = np.arange(len(block.rows))
-
-    def at_place(values: AnyArray) -> AnyArray:
-        return np.ascontiguousarray(values[row, block.place][:, None])
-
-    columns: dict[str, Any] = {name: at_place(getattr(replayed, name)) for name in PER_LINK}
+    at = np.arange(len(block.rows)), block.place
+    columns: dict[str, Any] = {key: np.ascontiguousarray(getattr(replayed, key)[at][:, None]) for key in PER_LINK}
     return replace(
         replayed,
         **columns,

@@ -1132,10 +1132,7 @@ def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, Le
     pair = series.pair
     if pair is not None:
         read_pair(named.folder / pair.file, pair.length, pair.prior_sd_db, named.written(pair.file))
-        pair = LearnedPair(
-            file=str(named.folder / pair.file), sha256=named.entry.tables[pair.file], length=pair.length,
-            prior_sd_db=pair.prior_sd_db,
-        )  # fmt: skip
+        pair = pair.model_copy(update={"file": str(named.folder / pair.file), "sha256": named.entry.tables[pair.file]})
     spread = series.spread if end == "tower" else _airframe_spread(named.entry.errors, series.spread)
     return path, LearnedAntenna(
         sha256=written.sha256, command=written.command, pair=pair if end == "tower" else None, spread=spread

@@ -140,7 +140,7 @@ class Stages:
         try:
             yield
         finally:
-            # store it also after a failure or an interrupt, because the page reports the time spent
+            # store it even after a failure or an interrupt, because the page reports the time spent
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
             give_memory_back()
 

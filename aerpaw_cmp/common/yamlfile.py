@@ -481,7 +481,7 @@ KeyPath = tuple[str, ...]
 
 
 def edited(text: str, changes: Mapping[KeyPath, Any]) -> str:
-    r"""Return text with other values at some keys. The value None removes a key.
+    r"""Return YAML text in which some keys have new values. The value None removes a key.
 
     Parameters
     ----------

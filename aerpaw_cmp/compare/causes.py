@@ -595,7 +595,7 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
         return
     best, cost = _likeliest(e, levels, possible=nearer)
     rate = pairs[best][0]
-    # no name at the end of the search, because the best rate may be larger, and no clock is that wrong
+    # a rate at the end of the search gets no name: the best rate may be larger, and no clock is that wrong
     yield Trial(
         name="clock" if abs(rate) < max(_RATES) else _UNNAMED,
         cost=_RARE + cost, change_db=levels[best] - e.predicted_db,

@@ -569,8 +569,8 @@ _BOUND = 2.0
 # Number of segments of a flight. The regression coefficient in each comes from all other segments.
 _SEGMENTS = 24
 
-# Nominal share of flights with a false verdict on any channel. A nominal 0.05 has 1 to 10 % in simulations, because
-# small probabilities are estimated less accurately than the ends of an interval.
+# Nominal share of flights with a false verdict on any channel. With a nominal share of 0.05, 1 to 10 % of
+# simulated flights have one, because small probabilities are estimated less accurately than the ends of an interval.
 _FAMILY = 0.02
 
 Interval = tuple[float, float]

@@ -523,7 +523,7 @@ def _whitened(
         gains[row] = keep * uncertainty / variances[row]
         uncertainty = keep**2 * uncertainty * white**2 / variances[row] + 1.0 - keep**2
     flat = columns.reshape(len(columns), 1, -1)
-    out = np.empty((len(columns), len(memory), flat.shape[2]))  # the expectation of each row, until the subtraction
+    out = np.empty((len(columns), len(memory), flat.shape[2]))  # expected rows, later residuals
     out[0], buffer = 0.0, np.empty_like(out[0])
     np.multiply(flat[:-1], gains[:-1, :, None], out=out[1:])
     for last, expected, keep in zip(out[:-1], out[1:], (keeps - gains)[..., None], strict=False):

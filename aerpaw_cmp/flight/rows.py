@@ -98,7 +98,7 @@ def may_lose_lock(stream: Stream) -> bool:
         return False
     quality = stream.frame["rss_db"].to_numpy(np.float64)
     locked = quality[quality > _LOST_QUALITY_DB]
-    # near its peak in lock, while the SNR of other receivers varies by tens of decibels
+    # in lock it is near its peak, while the SNR of other receivers varies by tens of decibels
     return bool(len(locked)) and abs(float(np.median(locked)) - _LOCK_QUALITY_DB) < 3.0
 
 

@@ -242,7 +242,7 @@ def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[Measure
     folder : Path
         Folder of the antenna files and of calibrations.
     site : str or Path
-        Site among whose learned tables an antenna is searched whose file does not name its logs.
+        Site with learned tables. If the file of an antenna does not name its logs, the same table is searched there.
 
     Returns
     -------

@@ -81,7 +81,7 @@ def channel_parts(
         A flight with logs, or with a plan only.
     chosen : ChannelOptions
     stages : Stages, optional
-        Times "replay" and "paths".
+        Receives the times of the stages "replay" and "paths".
     room : int, optional
         Largest size of all parts together [bytes]. None means a single part in memory.
 

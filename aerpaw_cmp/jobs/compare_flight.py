@@ -72,7 +72,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> records.FlightRes
     results = []
     for series, replayed in zip(data.rss, replays.rss, strict=True):
         results.append(compare_rss_series(data, series, replayed))
-        give_memory_back()  # a series of ten hours leaves 100 MiB of free fragments, which the ranks need
+        give_memory_back()  # a series of ten hours leaves 100 MiB in fragments, and the ranks need them
     results = with_corrected_verdicts(results)
     cause, step = cause_of(data, replays, results)
     return records.FlightResult(

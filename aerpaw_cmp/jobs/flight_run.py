@@ -405,7 +405,7 @@ class _ModelSearch:
         return level, series.step * (search_s + time.perf_counter() - begin)
 
     def _paths(self, index: int, model: Model) -> tuple[Replay, PathSet, FloatArray | None, float]:
-        """Return the replay, its paths for a model, their losses [dB], and the seconds."""
+        """Return the replay, its paths for a model, their losses [dB], and the time that they took [s]."""
         # antennas and attitude do not change paths and losses
         key = self._like[index], dataclasses.replace(model, antennas="isotropic", attitude="ignored")
         if key not in self._lost:
@@ -420,7 +420,7 @@ class _ModelSearch:
         return self._lost[key]
 
     def _traced_for(self, index: int, model: Model) -> tuple[Replay, float]:
-        """Return the replay between single elements, and its seconds."""
+        """Return the replay between single elements, and the time that it took [s]."""
         direct = model.relief != "flat" and model.ground == "none"  # the search of reflections off terrain is slow
         key = self._like[index], model.buildings, model.relief, direct
         if key not in self._traced:

@@ -158,7 +158,7 @@ class OutcomeStore:
         except OSError as error:
             raise UsageError(
                 f"task results cannot be stored in {self.folder}: {error.strerror or error}",
-                expected="a folder that may be written",
+                expected="a writable folder",
                 cause="a disk that is full or read-only, or a file in the way",
             ) from None
 

@@ -186,7 +186,7 @@ def prior_cautions(sd_db: Mapping[str, float], beyond: float) -> list[str]:
     """
     parts = ", ".join(f"{name} {value:g} dB" for name, value in sd_db.items())
     texts = filled([OUTSIDE["site"]], percent=100.0 * beyond) if beyond else []
-    texts.append(f"The standard deviation is a prior: {parts}. One flight determines the offset and most of the rest.")
+    texts.append(f"The standard deviation is a prior: {parts}. One flight determines most of these parts.")
     return texts
 
 

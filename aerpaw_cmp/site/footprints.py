@@ -152,7 +152,7 @@ def import_footprints(
     trees : bool
         True if forests become single trees at random positions. By default they are media with a height.
     area_m : (east_min, east_max, north_min, north_max), optional
-        Area of the site; forests are cut off :data:`_FOREST_MARGIN_M` outside.
+        Area of the site; forests are cut at a distance of :data:`_FOREST_MARGIN_M` around it.
 
     Returns
     -------

@@ -114,7 +114,7 @@ def _planet(text: str, name: str) -> MeasuredPattern:
 
 
 def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float) -> dict[str, FloatArray]:
-    """Return the gain of cuts with attenuations below the peak, of either sign [dBi]."""
+    """Return the gain of cuts that contain attenuations below the peak, all positive or all negative [dBi]."""
     values = np.concatenate(list(cuts.values()))
     # attenuations have one sign; values of both signs are gains relative to a level
     if min(-values.min(), values.max()) > _RIPPLE_DB:

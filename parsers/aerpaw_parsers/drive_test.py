@@ -233,7 +233,7 @@ def _readings(
             "carrier": "" if cell.place.startswith(("serving", "n")) else cell.place.replace(" ", "_"),
             "column": "" if cell.place == "serving" and not cell.marks else cell.place.replace(" ", "_"),
         }  # fmt: skip
-        # an absent leg or neighbour is not a reading
+        # omit rows without a level, and NR cells and neighbours with neither RSRP nor PCI
         tables.append(pd.DataFrame({**values, **about, "pci": pci})[np.isfinite(level) & ~np.asarray(none)])
     joined: pd.DataFrame = pd.concat(tables) if tables else pd.DataFrame(columns=list(_cells.Reading._fields))
     return _marked(joined) if tables else joined

@@ -306,9 +306,11 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     )
     lower, upper, child, start, many, items = tree
     todo = np.empty(DEEPEST, np.int64)
-    todo[0] = 0
-    node, waiting = next_leaf(lower, upper, child, todo, 1, (a, inverse))
-    while node >= 0:
+    todo[0], waiting = 0, np.int64(1)
+    while True:  # inlined code, so a second call would be compiled as well
+        node, waiting = next_leaf(lower, upper, child, todo, waiting, (a, inverse))
+        if node < 0:
+            return -1
         for k in range(start[node], start[node] + many[node]):
             t = _share_to(corners[items[k]], a, way, length, rules.margin)
             # exclude the ends of the segment, because they lie on mirrors and antennas
@@ -317,8 +319,6 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
             hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
             if not (_at_end(before, hit, t * length, rules) or _at_end(after, hit, (1.0 - t) * length, rules)):
                 return items[k]
-        node, waiting = next_leaf(lower, upper, child, todo, waiting, (a, inverse))
-    return -1
 
 
 @part
@@ -542,7 +542,7 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
     spots, stack, reached = np.zeros((depth, 3)), np.empty(DEEPEST, np.int64), np.empty(len(targets), np.int64)
     next_faces[0, : len(firsts)] = firsts
     images[0], waiting[0] = source, len(firsts)
-    level = 0
+    level = np.int64(0)  # a literal has a type of its own, for which functions would be compiled again
     while level >= 0:
         if turn[level] >= waiting[level]:
             level -= 1
@@ -568,7 +568,7 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
         image[1] = place[1] - 2.0 * height * n1
         image[2] = place[2] - 2.0 * height * n2
         # planes of the beam: this face, the mirrored planes of earlier faces, and the sides of this face
-        mine, number = planes[level], 1
+        mine, number = planes[level], np.int64(1)
         mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2
         mine[0, 3] = -sign * offset[f] + SIDE_M
         # skip plane 0 of the level before, which is the face itself and not a side of the beam
@@ -578,7 +578,7 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
             mine[number, 0], mine[number, 1], mine[number, 2] = b0 - twice * n0, b1 - twice * n1, b2 - twice * n2
             mine[number, 3] = planes[level - 1, p, 3] + twice * offset[f]
             number += 1
-        if not flatwise and (level + 1 < depth or not box_outside(tree.lower, tree.upper, 0, mine, number)):
+        if not flatwise and (level + 1 < depth or not box_outside(tree.lower, tree.upper, np.int64(0), mine, number)):
             number = _side_planes(mine, number, image, window[f])
         many[level] = number
         met = within_planes(tree, mine, number, stack, reached)

@@ -274,7 +274,9 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     high = np.maximum.reduceat(corners.max(axis=1), first[:-1], axis=0)
     # enlarge by the tolerance, so that neighbours in one plane touch
     face_tree = box_tree(low - merge_m, high + merge_m)
-    plane = _shared_planes(face_tree, corners, first, (normal, offset), face_area, (low, high), merge_m)
+    # largest first, so that each face is tested after all faces that it may join
+    order = np.argsort(-face_area, kind="stable")
+    plane = _shared_planes(face_tree, corners, first, (normal, offset), face_area, order, (low, high), merge_m)
     of_face = shape[first[:-1]]
     # faces are numbered within their shape
     numbers = defaultdict[int, Iterator[int]](lambda: itertools.count(1))
@@ -378,7 +380,7 @@ def _lie_in(corners, first, after, plane, merge_m):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type: ignore[no-untyped-def]
+def _shared_planes(tree, corners, first, planes, area, order, bounds, merge_m):  # type: ignore[no-untyped-def]
     """Return, for each face, the face whose plane it uses.
 
     This is a larger face that it touches and in whose plane it lies, or the face itself.
@@ -388,11 +390,11 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
     near, todo = np.empty(len(normal), np.int64), np.empty(DEEPEST, np.int64)
     # sides of the box of a face
     sides = np.zeros((6, 4))
-    sides[:3, :3], sides[3:, :3] = np.eye(3), -np.eye(3)
-    # largest first, so that each face is tested after all faces that it may join
-    for f in np.argsort(-area):
-        sides[:3, 3], sides[3:, 3] = merge_m - low[f], high[f] + merge_m
-        many = within_planes(tree, sides, 6, todo, near)
+    for f in order:
+        for axis in range(3):
+            sides[axis, axis], sides[axis, 3] = 1.0, merge_m - low[f, axis]
+            sides[3 + axis, axis], sides[3 + axis, 3] = -1.0, high[f, axis] + merge_m
+        many = within_planes(tree, sides, np.int64(6), todo, near)  # a literal would be another type, and compiled again
         best = -1
         for neighbour in near[:many]:
             if area[neighbour] < area[f] or (area[neighbour] == area[f] and neighbour >= f):

@@ -94,6 +94,9 @@ def check(path):
         rank = data["rank"].attrs
         assert rank["flag_meanings"].split()[0] == "out_of_coverage"
         assert rank["flag_values"].tolist() == [0, 1, 2, 3, 4]
+        # 'rank_1', because a bare number next to the values could be taken for one; words stay as they are
+        learned = data["rank_learned_h030m_LW1"].attrs["flag_meanings"]
+        assert learned == "Z rank_1 rank_2 rank_3 rank_4"
         import pyproj
 
         crs = pyproj.CRS.from_wkt(data["crs"].attrs["crs_wkt"])

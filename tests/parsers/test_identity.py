@@ -173,6 +173,12 @@ def test_rows_whose_identity_is_empty_are_no_part_of_another(tmp_path: Path) -> 
     assert levels == [{-70.0}, {-110.0}]
 
 
+def test_a_series_has_the_name_of_its_source_and_a_number_that_of_its_column(tmp_path: Path) -> None:
+    rows = "".join(f"{1749564000 + i},{'7' if i % 2 else 'A1'},{-70 - 40 * (i % 2)}\n" for i in range(20))
+    names = [stream.name for stream in read(tmp_path / "x.csv", f"time,tower,rsrp\n{rows}").streams]
+    assert names == ["rsrp_A1", "rsrp_tower7"]
+
+
 def test_a_column_of_an_unknown_name_whose_values_alternate_without_turns_is_asked_about(tmp_path: Path) -> None:
     """A second source is 12 dB lower, at random between the rows of the first. A waypoint is not a source."""
     chance = random.Random(3)

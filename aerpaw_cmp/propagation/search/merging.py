@@ -394,7 +394,7 @@ def _shared_planes(tree, corners, first, planes, area, order, bounds, merge_m): 
         for axis in range(3):
             sides[axis, axis], sides[axis, 3] = 1.0, merge_m - low[f, axis]
             sides[3 + axis, axis], sides[3 + axis, 3] = -1.0, high[f, axis] + merge_m
-        many = within_planes(tree, sides, np.int64(6), todo, near)  # a literal would be another type, and compiled again
+        many = within_planes(tree, sides, np.int64(6), todo, near)  # a literal 6 has a type of its own
         best = -1
         for neighbour in near[:many]:
             if area[neighbour] < area[f] or (area[neighbour] == area[f] and neighbour >= f):

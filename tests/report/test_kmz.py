@@ -2,6 +2,7 @@
 
 import dataclasses
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -202,6 +203,12 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
     assert "Thinned to about" in text
     lines = text.split("LW1 USRP1, Residual")[1].split("</Folder>")[0]
     assert lines.count(" ") < 600
+
+
+def test_a_line_of_several_levels_names_the_lowest_and_the_highest():
+    item = SimpleNamespace(unit="dB")
+    assert kmz._label(item, np.array([-80.0, np.nan, -70.0, -75.0]), 0) == "-80.0 to -70.0 dB"
+    assert kmz._label(item, np.array([-80.0, np.nan, -80.0]), 0) == "-80.0 dB"
 
 
 def test_every_rank_has_its_own_colour():

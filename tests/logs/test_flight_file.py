@@ -112,6 +112,7 @@ def test_long_columns_are_compressed_and_equal(tmp_path: Path) -> None:
             "time": np.arange(rows).astype("datetime64[s]").astype("datetime64[ns]"),
             "line": np.arange(1, rows + 1),
             "flag": pd.Series(["", "repeated"] * (rows // 2), dtype=object),
+            "state": pd.Series(["on", None, "off", ""] * (rows // 4), dtype=object),
             "rss_db": np.linspace(-80, -20, rows).round(1),
         }
     )

@@ -345,9 +345,11 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
         return False
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone)
     before_db, after_db = (_rmse_db([_best(table, of) for table in shown]) for of in (beside, {*beside, name}))
-    share = max(alone_db / known_db, after_db / before_db) if known_db and before_db else 1.0
-    if lead < need.lead:
+    if lead < need.lead or known_db - alone_db < SHOWN_DB or not before_db:
         return False
+    # another cause may hide the effect of an almost certain one on the total error
+    hidden = bool(beside) and lead >= _CERTAIN
+    share = after_db / before_db if hidden else max(alone_db / known_db, after_db / before_db)
     least_share = max(need.share, need.learned_share * (sound[0].evidence.antenna == "learned"))
     certain = lead >= _CERTAIN and least_share <= _LEAST_SHARE and share <= 1.0 - 0.5 * _LEAST_SHARE
     if need.follows and any(m.residual_db.std() >= need.follows * m.evidence.measured_db.std() for m in alone):
@@ -357,10 +359,13 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     if name == CATCH_ALL and (known_db < _LEAST_DB or (lead < _SURE_GAIN and not _holds_in_halves(alone, most))):
         return False
     # a floor that the settings remove is known, and explains why the remaining low links look too strong
-    if (name == "floor" and sound[0].evidence.floored) or known_db - alone_db < SHOWN_DB:
+    if name == "floor" and sound[0].evidence.floored:
         return False
     if usual is None:
-        enough = not need.part or after_db <= before_db - need.part * (before_db - _together_db(shown))
+        # if a cause is almost certain, what all candidates remove beyond the likeliest explanation is fading
+        likeliest = [max(table.values(), key=lambda model: model.gain) for table in shown]
+        left_db = _together_db(shown) if lead < _CERTAIN else _rmse_db(likeliest)
+        enough = not need.part or after_db <= before_db - need.part * (before_db - left_db)
     else:
         # do not name such a cause for an error that held-out flights also have
         least_db = usual[1] if name in OF_DIRECTION else usual[0] if name == "saturation" and not certain else 0.0

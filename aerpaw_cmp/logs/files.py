@@ -98,9 +98,8 @@ def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
         parts.append(piece)
         size += len(piece)
         if size > most:
-            raise InputError(
-                f"the {packed_form(raw)} file unpacks to more than {most} bytes", cause="not a log", path=path
-            )
+            found = f"the {packed_form(raw)} file unpacks to more than {most} bytes"
+            raise InputError(found, cause="not a log", path=path)
     return b"".join(parts)
 
 

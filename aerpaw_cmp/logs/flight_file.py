@@ -237,10 +237,8 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     if form != FORMAT:
         raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
     if version != _VERSION:
-        found = f"flight file of version {version}"
-        raise InputError(
-            found, expected=f"version {_VERSION}", cause="a newer version of this tool wrote it", path=path
-        )
+        found, expected = f"flight file of version {version}", f"version {_VERSION}"
+        raise InputError(found, expected=expected, cause="a newer version of this tool wrote it", path=path)
     with parsing(
         path, "a flight file of 'aerpaw-cmp ingest -o'", "a truncated copy: ingest the logs again", any_shape=True
     ):

@@ -256,9 +256,8 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
         )
     known = claims(data)
     if known and not known[0].kinds:
-        raise InputError(
-            f"not a log: {known[0].title}", expected="one of the formats of 'aerpaw-cmp formats'", path=path
-        )
+        found = f"not a log: {known[0].title}"
+        raise InputError(found, expected="one of the formats of 'aerpaw-cmp formats'", path=path)
     if len(known) == 1:
         return known[0]
     if known:

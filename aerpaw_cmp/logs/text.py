@@ -94,7 +94,7 @@ class Lines:
         """Return line ``i`` as a rejected line."""
         return RejectedLine(int(i) + 1, reason, self.text(i))
 
-    def reject_all(self, numbers: IntArray, reason: str) -> list[RejectedLine]:
+    def reject_all(self, numbers: Iterable[int], reason: str) -> list[RejectedLine]:
         """Return several lines as rejected for one reason."""
         return [self.reject(int(i), reason) for i in numbers]
 
@@ -431,9 +431,8 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
             f"until the log's clock steps back; flagged {_AMBIGUOUS}"
         )
     if nonexistent.any():
-        warnings.append(
-            f"{counted(int(nonexistent.sum()), 'time')} in the hour that {name} skipped (wrong zone?): {_NONEXISTENT}"
-        )
+        times = counted(int(nonexistent.sum()), "time")
+        warnings.append(f"{times} in the hour that {name} skipped (wrong zone?): {_NONEXISTENT}")
     return Instants(utc.view("datetime64[ns]"), ambiguous, nonexistent, tuple(warnings))
 
 

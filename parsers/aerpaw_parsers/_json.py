@@ -70,9 +70,7 @@ def objects(lines: Lines) -> Objects:
             rows += [i] * len(listed)
             values += listed
         else:
-            rejected.append(
-                lines.reject(i, "not a JSON object (truncated line?)" if value is None else "not a JSON object")
-            )
+            rejected.append(lines.reject(i, "not a JSON object" + " (truncated line?)" * (value is None)))
     closed = len(set(rows)) < len(rows)
     return Objects(np.array(rows, dtype=np.int64), values, rejected, np.array(more, dtype=np.int64), closed)
 

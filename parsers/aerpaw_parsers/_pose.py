@@ -163,9 +163,7 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     """Return datum and values of the most useful column of heights, in the order of the dictionary."""
     column = sheet.find("altitude_m")
     if column is None:
-        rows.warnings.append(
-            "no column is known as a height, so heights are unknown: use another log for the track if it has heights"
-        )
+        rows.warnings.append("no column is known as a height: heights are unknown (does another log have them?)")
         return "unknown", np.full(len(rows), np.nan)
     meaning = sheet.meanings[column]
     assert meaning is not None
@@ -411,9 +409,7 @@ def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     values = sheet.found(*ANGLES)
     named = any(sheet.unit(column) for column in map(sheet.find, values) if column is not None)
     if not named and are_radians(values):
-        rows.warnings.append(
-            "the unit of the angles is unknown: read as radians because of their values, which is a guess"
-        )
+        rows.warnings.append("the unit of the angles is unknown: read as radians because of their values, a guess")
         values = {key: np.degrees(value) for key, value in values.items()}
     elif not named and not set(ANGLES) <= set(values) and are_small(values):
         rows.warnings.append(small_angles(values))
@@ -428,9 +424,7 @@ def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
 def small_angles(values: Iterable[str]) -> str:
     """Return the sentence about angles whose unit is neither in their names nor visible in their values."""
     words = " and ".join(name.removesuffix("_deg") for name in values)
-    return (
-        f"the unit of {words} is unknown, and no value is beyond 2 pi: read as degrees (radians? call it 'yaw [rad]')"
-    )
+    return f"the unit of {words} is unknown; no value is beyond 2 pi: read as degrees (radians? call it 'yaw [rad]')"
 
 
 def are_small(values: dict[str, FloatArray]) -> bool:

@@ -67,8 +67,8 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
     by_name: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []
     count, at, end = 0, 0, len(data)
-    while at + 3 <= end:
-        form = forms.get(data[at + 2]) if data[at : at + 2] == _MARK else None
+    while at < end:
+        form = forms.get(data[at + 2]) if data[at : at + 2] == _MARK and at + 3 <= end else None
         if form is None or form.length < 3 or at + form.length > end:
             next_mark = data.find(_MARK, at + 1)
             next_mark = end if next_mark < 0 else next_mark
@@ -87,10 +87,6 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
             by_name[form.name].setdefault(tuple(form.columns), []).append((count + len(damaged), values))
         count += 1
         at += form.length
-    if at < end:
-        damaged.append(
-            RejectedLine(count + len(damaged) + 1, f"{end - at} bytes at the end that are not a message", "")
-        )
     return by_name, count, damaged
 
 

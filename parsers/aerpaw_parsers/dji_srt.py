@@ -58,10 +58,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     placed = [(i, cells) for i, cells in readings if cells["latitude"] and cells["longitude"]]
     if lines.unterminated and placed and re.search(rb"[\d.]$", data):  # a truncated number may have lost digits
         del placed[-1]
-    torn = [
-        lines.reject(i, "a subtitle without a position (truncated?)")
-        for i in sorted({*number} - {i for i, _ in placed})
-    ]
+    torn = lines.reject_all(sorted({*number} - {i for i, _ in placed}), "a subtitle without a position (truncated?)")
     return _pose.of_readings(lines, placed, torn, options, reader=READER.name)
 
 

@@ -14,12 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import dictionary
 from aerpaw_cmp.logs.readers import unknown_name
-from aerpaw_cmp.logs.text import add_flag, no_flags, split
-from aerpaw_cmp.readers import COLUMNS, Kind, Reader, ReadOptions, ReadResult, Rows, Stream
+from aerpaw_cmp.logs.text import add_flag, split
+from aerpaw_cmp.readers import COLUMNS, Kind, Reader, ReadOptions, ReadResult, Rows, Stream, counted, dictionary
 
 from . import _identity, _pose, _sheet
 
@@ -56,9 +54,7 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     if absent := sorted({name for name in options.columns.values() if name not in header}):
         raise unknown_name(f"the file has no column {absent[0]!r}", absent[0], header[:40])
     if options.kind == "rank" and options.ri_base is None:
-        raise UsageError(
-            "the table does not show whether rank 1 is written as 0 or 1", expected="'ri_base:' zero or one"
-        )
+        raise UsageError("the table does not show whether rank 1 is 0 or 1", expected="'ri_base:' zero or one")
     return options.kind, {column: header.index(name) for column, name in options.columns.items()}
 
 
@@ -167,8 +163,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             # all cells of a device have one zero of heights
             of_part = None if heights is None else heights[np.searchsorted(of_device.row, part.row)], about
             streams.append(_stream(part, cells, kind, where, words, options.unit or unit, of_part))
-        if kind == "rss":
-            streams.append(_track(of_device, table, where, device, (heights, about)))
+        track = {name: column for name, column in where.items() if name in COLUMNS["telemetry"]}
+        if kind == "rss" and {*_pose.PLACE[:2]} <= {*track}:
+            name = "_".join(filter(None, ("vehicle", device)))
+            streams.append(_stream(of_device, table, "telemetry", track, name, "", (heights, about)))
     sheet.used |= {i for i, name in enumerate(header) if name in options.read_elsewhere}
     rows.warnings += sheet.remarks()
     return rows.result(streams)
@@ -209,7 +207,7 @@ def _stream(
         rows.warnings += [f"{coarse}: is it the right column?"] if coarse else []
     above, about = heights
     values |= {} if above is None else {"altitude_m": above}
-    odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
+    odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind] if key in where], axis=0)
     add_flag(flag, odd, "no_number")
     if odd.any():
         lines = counted(int(odd.sum()), "row is", "rows are")
@@ -231,11 +229,12 @@ def _stream(
         values["rank"] = np.where(good, ri + 1 - base, np.nan)
         about = {"ri_base": options.ri_base, **about}
     else:
-        latitude, longitude, altitude = (values[key] for key in _pose.PLACE)
+        place = {key: values[key] for key in _pose.PLACE if key in values}
+        latitude, longitude, *altitude = place.values()
         # loggers write -999 if there is no fix, here with a margin for rounding
-        lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
+        lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & np.all([m > -998.5 for m in altitude], axis=0))
         add_flag(flag, lost, "no_fix")
-        values |= {key: np.where(lost, np.nan, values[key]) for key in _pose.PLACE}
+        values |= {key: np.where(lost, np.nan, column) for key, column in place.items()}
         for key in {"fix", "satellites"} & set(values):
             values[key] = np.where(np.isnan(values[key]), -1, values[key]).clip(-1, 255).astype(np.int64)
     return rows.stream(kind, name, values, flag=flag, about=about)
@@ -251,19 +250,6 @@ def _above_takeoff(rows: Rows, sheet: _sheet.Sheet, where: dict[str, int]) -> _H
     values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in _pose.PLACE}
     lost = _pose.without_fix(sheet) | np.isnan(values[_pose.PLACE[0]])
     return _pose.above_takeoff(rows, values, height.quantity.datum, lost)
-
-
-def _track(rows: Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str, heights: _Heights) -> Stream | None:
-    """Return positions in the rows of levels as the track of the flight, as in a table merged by hand."""
-    names = [name for name in COLUMNS["telemetry"][:-2] if name in where]
-    if not {"latitude_deg", "longitude_deg"} <= set(names):
-        return None
-    values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
-    values[_pose.PLACE[0]] = np.where(_pose.without_fix(sheet), np.nan, values[_pose.PLACE[0]])
-    above, about = heights
-    values |= {} if above is None else {"altitude_m": above}
-    name, flag = f"vehicle_{device}" if device else "vehicle", no_flags(len(rows))
-    return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)
 
 
 READER = Reader(

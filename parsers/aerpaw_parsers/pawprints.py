@@ -63,9 +63,8 @@ def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     lines = split(data)
     row, groups = match(lines, _TEXT)
     cells = [_text_cells(lines.raw(i)) for i in row.tolist()]
-    odd = [lines.reject(i, "a block of other fields (quantities switched off in the app?)")
-             for i, block in zip(row.tolist(), cells, strict=True) if block is None]  # fmt: skip
     sound = np.array([item is not None for item in cells], dtype=bool)
+    odd = lines.reject_all(row[~sound], "a block of other fields (quantities switched off in the app?)")
     rows = built(
         lines, row[sound], {"time": np.array([float(group[0]) for group in groups], dtype=np.float64)[sound]}, options,
         reader="pawprints", clock="epoch_ms", others=OtherLines(

@@ -55,9 +55,7 @@ def _tables(lines: _text.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, f
         if heads is None:
             continue  # neighbours and operators are not read
         if not time or len(cells) != len(heads):
-            rejected.append(
-                lines.reject(i, "a table row without a time, or with other columns than its heading (truncated?)")
-            )
+            rejected.append(lines.reject(i, "a row without a time, or with other columns than its title (truncated?)"))
             continue
         kind = next((word for word in (b"LTE", b"NR5G") if word in row[3] and title == b"servingcell"), title)
         entries.append((i, time, kind.decode("ascii"), dict(zip(heads, map(_number, cells), strict=True))))

@@ -21,9 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, built, split
+from aerpaw_cmp.readers import InputError, Reader, ReadOptions, ReadResult, RejectedLine, Rows, Stream, built, split
 
 from . import _json, _pose, _stamps
 

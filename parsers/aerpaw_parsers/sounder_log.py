@@ -265,9 +265,7 @@ def _stream(log: _Piece, repeats: _Samples, options: ReadOptions, warnings: list
         samples = samples.join(repeats)
         repeated = np.isin(samples.line, repeats.line)  # lines of '*' contain no other samples
         restored = counted(len(repeats.line), "sample was", "samples were")
-        warnings.append(
-            f"{restored} restored, flagged 'repeated': the program od writes '*' instead of values that repeat"
-        )
+        warnings.append(f"{restored} restored, flagged 'repeated': the program od writes '*' for values that repeat")
     # a log may have 1 GB: free each column as soon as it is not needed
     jump = samples.offset
     jump[1:] -= jump[:-1]

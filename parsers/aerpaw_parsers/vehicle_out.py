@@ -104,8 +104,6 @@ def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
     no_fix = (number["fix"] < 2) | (np.fmin(longitude, latitude) < _INVALID_POSITION) | (altitude < -998.5)
     no_fix |= (latitude == 0) & (longitude == 0)
     rows.mark(no_fix, "no_fix")
-    outside = ~no_fix & ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(altitude) < 1e5))
-    rows.mark(outside, "position_out_of_range")
     zero = (number["pitch"] == 0) & (number["yaw"] == 0) & (number["roll"] == 0)
     rows.mark(zero, "zero_attitude")
     motion = {f"{name}_deg": np.degrees(number[name]) for name in ("roll", "pitch", "yaw")}
@@ -123,7 +121,7 @@ def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
     if len(rows) > 10 and (number["fix"] == 6).all() and (number["satellites"] == 10).all():
         rows.warnings.append("fix 6 with 10 satellites throughout: probably a run of the digital twin, not a flight")
     counts = {name: number[name].astype(np.int64) for name in ("fix", "satellites")} | {"battery_v": number["volt"]}
-    return {name: np.where(no_fix | outside, np.nan, part) for name, part in place.items()} | motion | counts
+    return {name: np.where(no_fix, np.nan, part) for name, part in place.items()} | motion | counts
 
 
 READER = Reader(

@@ -9,6 +9,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.text import counted
+from aerpaw_cmp.logs import limits
 from aerpaw_cmp.logs.readers import ReadOptions, by_name, identify
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from tests.parsers import samples
@@ -71,7 +72,7 @@ def test_all_generations_of_telemetry_agree(data: bytes) -> None:
 @pytest.mark.parametrize(
     ("longitude", "latitude", "altitude", "fix", "flag"),
     [
-        ("180.0", "90.0", "99999", "2", ""),
+        ("180.0", "90.0", "19999", "2", ""),
         ("-180.0", "-90.0", "-998.5", "3", ""),  # the sentinel is -999
         ("180.01", "35", "1", "3", "position_out_of_range"),
         ("-78", "90.01", "1", "3", "position_out_of_range"),
@@ -84,7 +85,7 @@ def test_all_generations_of_telemetry_agree(data: bytes) -> None:
 )
 def test_limits_of_a_vehicles_position(longitude: str, latitude: str, altitude: str, fix: str, flag: str) -> None:
     row = f"0,{longitude},{latitude},{altitude},48.1,2025-03-02 10:00:00.250000,{fix},12\n"
-    result = by_name("vehicle_out").read(row.encode(), OPTIONS)
+    result = limits.check(by_name("vehicle_out").read(row.encode(), OPTIONS))
     (stream,) = result.streams
     assert stream.frame["flag"].tolist() == [flag]
     assert np.isnan(stream.frame["altitude_m"][0]) == bool(flag)

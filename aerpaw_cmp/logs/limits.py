@@ -205,6 +205,8 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     )
 
 
+# A change of height beyond this and beyond a climb at this speed is not flown [m, m/s].
+_HEIGHT_M, _CLIMB_MPS = 5.0, 10.0
 _SPEEDS = ("velocity_north_mps", "velocity_east_mps")
 
 
@@ -312,10 +314,10 @@ _BELOW_M = 15.0
 # Highest level that is possible in flight: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
 # SINR do not.
 _MOST_DBM = {"RSRP": -20.0}
-# A lost reading is within the first limit of 0 dB or of a placeholder, and farther than the second from all other
-# levels. The third is the largest share of lost readings. No path gains 20 dB from one reading to the next and loses it
-# again.
-_LOST_DB, _FAR_DB, _LOST_SHARE, _CUT_DB = 1.0, 20.0, 0.2, 15.0
+# A lost reading is within the first limit of 0 dB, is a placeholder, or repeats the lowest or highest level, and is
+# farther than the second from all other levels. The third is the largest share of lost readings. No path gains 20 dB
+# from one reading to the next and loses it again.
+_LOST_DB, _FAR_DB, _LOST_SHARE, _CUT_DB = 1.0, 20.0, 0.4, 15.0
 # Lowest values of phones, modems and 8-bit integers, which programs write for a missing reading.
 _LEAST_DB = (-127.0, -128.0, -140.0, -141.0, -150.0, -156.0, -157.0)
 # Levels of two devices alternate from record to record: they differ by more than fading, and return with the next
@@ -346,6 +348,7 @@ class _Check:
             self._within_ports()
         if kind == "telemetry":
             self._mostly_above_zero()
+            self._lost_heights()
         self._near_in_time()
         if kind == "rss":
             self._all_silent()
@@ -452,12 +455,14 @@ class _Check:
         # -92 at the end of a file may have become -9, -127 may have become -12
         most = np.where(self.frame["flag"].to_numpy() == UNTERMINATED, _CUT_DB, _LOST_DB)
         # -1 is also a common placeholder
-        for lost, sign, word in ((np.abs(level) <= most, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):
-            known = np.isfinite(level).sum()
+        for of_program, sign, word in ((np.abs(level) <= most, 1, "above"), (np.isin(level, _LEAST_DB), -1, "below")):
+            known, end = np.isfinite(level).sum(), level == sign * np.fmax.reduce(sign * level, initial=-np.inf)
+            lost = of_program if of_program.any() or end.sum() < _FEW_ROWS else end
             if not lost.any() or lost.sum() > max(1, _LOST_SHARE * known) or known < _FEW_ROWS:
                 continue
             nearest = sign * float(np.nanmax(sign * level[~lost]))
-            if np.min(sign * (level[lost] - nearest)) > _FAR_DB:
+            varies = of_program.any() or len(np.unique(level[~lost])) > _FEW_ROWS
+            if varies and np.min(sign * (level[lost] - nearest)) > _FAR_DB:
                 first = f"{level[int(np.argmax(lost))]:g} dB"
                 why = f"far {word} all others, which end at {nearest:.1f} dB (a lost reading?)"
                 self._flag(lost, "level_lost", first, why, ["rss_db"])
@@ -486,6 +491,25 @@ class _Check:
             f"{self._what}: its levels alternate, {apart:.0f} dB apart {when}: several devices, SIMs or networks in "
             "one series, without a known column that names them"
         )
+
+    def _lost_heights(self) -> None:
+        """Flag heights that leap to one value and back, such as 0 in flight."""
+        height, time = self.frame[PLACE[2]].dropna(), self.frame["time"].to_numpy("datetime64[ns]")
+        begins = np.concatenate([[0], np.flatnonzero(np.diff(height)) + 1])
+        if len(begins) < 2 * _AROUND:
+            return
+        step_s = np.abs(np.diff(time[height.index]) / np.timedelta64(1, "s"))[begins[1:] - 1]
+        # a receiver may report more rarely than the logger writes
+        step_s = np.maximum(step_s, np.median(step_s * np.diff(begins)))
+        rise_m, rows = np.diff(height.to_numpy()[begins]), np.diff(begins)[1:]
+        leaps = np.abs(rise_m) / (_HEIGHT_M + _CLIMB_MPS * step_s)
+        # a single row has to leap farther than a value that is written several times
+        back = (np.minimum(leaps[:-1], leaps[1:]) > np.where(rows > 1, 1, _AROUND)) & (rise_m[:-1] * rise_m[1:] < 0)
+        lost = np.zeros(len(time), dtype=np.bool_)
+        lost[height.index] = np.repeat([False, *back, False], np.diff(begins, append=len(height)))
+        if 0 < lost.mean() <= _FEW_JUMPS_SHARE:
+            first = f"{height[int(np.argmax(lost))]:g} m"
+            self._flag(lost, "height_lost", first, "a leap and a return beyond any climb", [PLACE[2]])
 
     def _near_in_time(self) -> None:
         """Flag a few time stamps that are days from all other time stamps."""

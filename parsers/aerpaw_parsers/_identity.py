@@ -208,7 +208,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
             alternates, in_turns = _alternates(time, part, i, level)
             marks += [i] if in_turns else []
             if alternates and not in_turns:
-                text = f"column {sheet.names[i]!r}: the level changes with its values from row to row"
+                text = f"column {sheet.names[i]!r}: the level changes with its values"
                 rows.warnings.append(f"{text}, but {_ASKED}")
     return marks
 
@@ -251,11 +251,10 @@ def few(texts: Iterable[str]) -> bool:
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
-# A column and the level alternate if at least _CHANGED of the rows have another value than the row before, and the
-# median level step within a value is below _SMALLER of the median step between values. They alternate in a fixed order
-# if at least _IN_TURN of the rows repeat the order of the rows before. _FEWEST is the smallest number of rows for this
-# test.
-_CHANGED, _SMALLER, _IN_TURN, _FEWEST = 0.3, 0.5, 0.8, 8
+# A column and the level alternate if the median level step within a value is below _SMALLER of the median step between
+# values, or below _SELDOM of it if the value changes less than _FEWEST times. They alternate in a fixed order if at
+# least _IN_TURN of the rows repeat the order of the rows before. _FEWEST is also the smallest number of rows.
+_SMALLER, _SELDOM, _IN_TURN, _FEWEST = 0.5, 0.2, 0.8, 8
 
 
 def _alternates(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) -> tuple[bool, bool]:
@@ -266,10 +265,11 @@ def _alternates(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) ->
     order = np.argsort(time, kind="stable")
     texts, values = texts[order], sheet.numbers(level)[order]
     changed, count = texts[1:] != texts[:-1], len({*texts.tolist()})
-    if changed.mean() < _CHANGED or len(texts) < 2 * count:
+    if not changed.any() or len(texts) < 2 * count:
         return False, False
     within = np.concatenate([np.abs(np.diff(values[texts == text])) for text in {*texts.tolist()}])
-    alternates = _typical(within) < _SMALLER * _typical(np.abs(np.diff(values))[changed])
+    smaller = _SMALLER if changed.sum() >= _FEWEST else _SELDOM
+    alternates = _typical(within) < smaller * _typical(np.abs(np.diff(values))[changed])
     in_turns = min(changed.mean(), (texts[count:] == texts[:-count]).mean()) >= _IN_TURN
     return alternates, alternates and bool(in_turns)
 
@@ -341,6 +341,8 @@ def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:
     """Return the attributes of a part: its identities as written, and a frequency in Hz."""
     about: dict[str, Attribute] = {}
     for name, text in written.items():
+        if _THOUSANDS.fullmatch(text) and "freq" in name and "ghz" not in name:  # 3,510 MHz: no UAV uses 3.51 MHz
+            text = text.replace(",", "")
         value, unit = _SI.fullmatch(text.replace(",", ".")), re.search(r"\b[kmg](?=hz$)", name)
         if value is not None and ("freq" in name or name[:2] == "f ") and (value[2] or unit or float(value[1]) > 1e6):
             si = value[2] or (unit[0] if unit else "")
@@ -350,6 +352,7 @@ def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:
     return about
 
 
+_THOUSANDS = re.compile(r"\d{1,2}(?:,\d{3})+(?:\.\d+)?")
 _SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
 _NO_IDENTITY = ("2147483647", "4294967295", "268435455", "65535", "-1", "9223372036854775807")
 

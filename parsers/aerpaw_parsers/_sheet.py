@@ -20,12 +20,12 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.text import decoded
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import NEAR_DEG
-from aerpaw_cmp.readers import OtherLines, ReadOptions, RejectedLine, Rows, built, counted, dictionary, instants_of
+from aerpaw_cmp.logs.rows import OtherLines, Rows, built, instants_of
+from aerpaw_cmp.readers import InputError, ReadOptions, RejectedLine, UsageError, counted, dictionary
 
 from . import _json, _stamps
 
@@ -390,9 +390,8 @@ class Sheet:
             text = f"column {self.names[column]!r}: unknown unit, read as {meaning.quantity.unit}"
             self.notes.setdefault(column, text)
         if self.unit(column) in dictionary.ACROSS_50_OHM:
-            self.notes[column] = (
-                f"column {self.names[column]!r}: dBuV are converted to dBm for a receiver of 50 ohm (-107 dB), a guess"
-            )
+            text = "dBuV are converted to dBm for a receiver of 50 ohm (-107 dB), a guess"
+            self.notes[column] = f"column {self.names[column]!r}: {text}"
         units = {unit for _, unit in parsed.values() if dictionary.is_unit(unit)}
         if not units:
             return dictionary.converted(values, self.unit(column))
@@ -452,9 +451,7 @@ class Sheet:
         words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
         if words:
             shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
-            text = (
-                "If one names the cell or device of a row, call it 'cell' or 'device' (next to other --map: NAME=cell)"
-            )
+            text = "If one names the cell or device of a row, call it 'cell' or 'device' (or --map NAME=cell)"
             said.append(f"not read: {shown}. {text}")
         gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         if gains:
@@ -922,7 +919,9 @@ def _to_utc(timed: Rows, sheet: Sheet, column: int | None) -> None:
 def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None:
     """Return the best column of times: UTC rather than local, and not the time of the last fix, which may stop."""
     column = sheet.find("time")
-    times = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "time"]
+    # a column with an unknown name is a clock if its cells contain dates and times of day
+    dated = {i for i, text in enumerate(sheet.cells[0]) if _CLOCK.match(text)} if sheet.cells else {}
+    times = [i for i, m in enumerate(sheet.meanings) if (m.quantity.name == "time" if m else i in dated)]
     if column is None or len(times) < 2:
         return column
     if "utc" not in sheet.plain[column].split():
@@ -1082,6 +1081,7 @@ _ELAPSED = re.compile(r"^(rel|relative|elapsed|up) ?time")
 _ZONED = re.compile(r":\d\d(?:\.\d+)?(?:Z|[+-]\d\d:?\d\d)$")
 # Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
+_CLOCK = re.compile(r"\d{4}-\d\d-\d\d.\d\d:\d\d")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 # A cell of a column that contains only AM or PM.
 _AM_PM = re.compile(r"[AaPp]\.?[Mm]\.?")

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from functools import cache
+from itertools import pairwise
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
@@ -116,9 +117,7 @@ def _order(
     if len(dates[0]["c"]) == 2:
         year_first = max(firsts) > 31 or (not _are_years(lasts) and _are_years(firsts))
         word = "first" if year_first else "last"
-        warnings.append(
-            f"the years of the dates have two digits: the {word} number is assumed to be the year, which is a guess"
-        )
+        warnings.append(f"the years have two digits: the {word} number is assumed to be the year, a guess")
         if year_first:
             return "ymd", warnings
     # 02.03.2025: with points, the day comes first
@@ -142,9 +141,7 @@ def _order(
     reason = "as in Europe" if european else "a guess"
     reason = "as in the date of the file name" if len(fits) == 1 else reason
     word = "day" if order == "dmy" else "month"
-    warnings.append(
-        f"the dates can be read with the day or the month first: the {word} is assumed to come first, {reason}"
-    )
+    warnings.append(f"the day or the month may come first in the dates: the {word} is read first, {reason}")
     return order, warnings
 
 
@@ -368,14 +365,28 @@ def read(
     order, warnings = _order(plain, options.file_name, european=european, day_first=day_first)
     bare = [match for text in plain if (match := _match(text)) and match.groupdict().get("second") is None]
     if len(set(filled)) < len(filled) and 2 * len(bare) > len(filled):
-        warnings.append(
-            "the times have no seconds (a table saved by a spreadsheet?): all rows of a minute share one time"
-        )
+        warnings.append("the times have no seconds (saved by a spreadsheet?): all rows of a minute share one time")
     cells = [
         text.encode() if _COMMON.fullmatch(text) and (not zone or text[-6] in "+-" or text[-1] == "Z")
         else _written(text, order, zone, options.timezone) for text in shown
     ]  # fmt: skip
-    return "wall", _text.cells(cells), warnings
+    return "wall", _text.cells(cells), warnings + _doubts_of_halves(filled, options, zone)
+
+
+def _doubts_of_halves(texts: Sequence[str], options: ReadOptions, zone: str) -> list[str]:
+    """Return a sentence about local times that a clock of 12 hours without AM and PM may have written."""
+    # texts of another form have a zone, or AM and PM
+    plain = bool(texts) and not zone and options.clock != "utc" and _PLAIN_CLOCK.fullmatch(texts[0])
+    hours = [int(found[1]) for text in texts if (found := _PLAIN_CLOCK.fullmatch(text))] if plain else [0]
+    turns = (12, 1) in pairwise(hours)
+    if not 1 <= min(hours) <= max(hours) <= (12 if turns else _NIGHT_H):
+        return []
+    what = "the hour 1 follows the hour 12" if turns else f"the local times are at night, such as {texts[0]}"
+    return [f"{what}: a clock of 12 hours without AM and PM? Write hours from 0 to 23, or add AM or PM to the times"]
+
+
+# A time without a zone, and the last hour of a night without flights.
+_PLAIN_CLOCK, _NIGHT_H = re.compile(r"[^:]*?(\d{1,2}):\d\d(?::[\d.,]+)?"), 5
 
 
 # The marks of Chinese, Japanese and Korean dates, and the spaces that browsers write before AM.
@@ -456,28 +467,19 @@ def _step(value: FloatArray) -> float:
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
 
 
-def _likely_units(value: FloatArray) -> list[str]:
-    """Return the units, from seconds down, in which numbers have the steps and the length of a flight."""
+def _likely_units(value: FloatArray, units: Mapping[str, float]) -> list[str]:
+    """Return the units in which numbers have the steps and the length of a flight. Each unit has its smallest step."""
     step, span = _step(value), np.diff(np.nanpercentile(value, (5, 95)))[0] if np.isfinite(value).any() else np.nan
     return [
-        unit for unit, least in _LEAST_STEPS.items()
+        unit for unit, least in units.items()
         if least <= step <= _LONGEST_STEP_S * 1e9 / _text.COUNTS[unit].ns
         and span <= _FLIGHT_S * 1e9 / _text.COUNTS[unit].ns
     ]  # fmt: skip
 
 
-def _longer_units(value: FloatArray) -> list[str]:
-    """Return the units above seconds in which a log of less than a minute has the steps and the length of a flight."""
-    step, span = _step(value), float(np.nanmax(value, initial=-np.inf) - np.nanmin(value, initial=np.inf))
-    return [
-        unit for unit, factor in (("min", 60.0), ("h", 3600.0))
-        if span < _SHORT_S and factor * step <= _LONGEST_STEP_S and factor * span <= _FLIGHT_S
-    ]  # fmt: skip
-
-
 def are_seconds(value: FloatArray, unit: str) -> bool:
     """Check whether the steps of numbers are too short in the unit of a program but plausible in seconds."""
-    return _step(value) * _text.COUNTS[unit].ns <= _LEAST_NS and "s" in _likely_units(value)
+    return _step(value) * _text.COUNTS[unit].ns <= _LEAST_NS and "s" in _likely_units(value, _LEAST_STEPS)
 
 
 def _numbers(
@@ -485,7 +487,7 @@ def _numbers(
 ) -> tuple[str, AnyArray, list[str]]:
     """Return numbers as epochs if they are large enough, else as relative times."""
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
-    step, likely = _step(value), _likely_units(value)
+    step, likely = _step(value), _likely_units(value, _LEAST_STEPS)
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
         # 0.9e9 s is July 1998: smaller numbers, and those with steps of odd hours, count from another origin
         hours = step / scale * 1e9 / 3600
@@ -506,7 +508,9 @@ def _numbers(
     late = whole and middle > 86_400  # more seconds than a day has
     unit = next((unit for unit in likely if unit != "s" or not late), "ms" if late and of_day and not likely else "s")
     unit = "s" if step in _QUARTERS and not (value % step).any() else unit
-    known = likely if whole else _longer_units(value)
+    # a log that is shorter than a minute in seconds may be in minutes or hours
+    longer = {} if whole or np.nanmax(value) - np.nanmin(value) >= _SHORT_S else {"min": 0.0, "h": 0.0}
+    known = likely if whole else _likely_units(value, longer)
     others = [other for other in dict.fromkeys(("s", *known)) if other != unit]
     if unit == "s" and not others:
         return "relative_s", value, []
@@ -583,7 +587,7 @@ def _of_day(
     named, start_s = _NEMO_NAME.search(options.file_name), _session_start_s(options)
     own_form = written == "Z" and any(text.startswith("T") for text in texts[:3])  # the form of Nemo Handy
     if not own_form or not len(first):
-        return _on_a_date(seconds, options, [], written)
+        return _on_a_date(seconds, options, _doubts_of_halves(texts, options, written), written)
     # Nemo Handy marks its local times as UTC, and some exports are off by hours: its summary contains the start
     hours = 0 if start_s is None else round((float(first[0]) - start_s) / 3600)
     name_s = int(named[1]) * 3600 + int(named[2]) * 60 + int(named[3]) if named else float(first[0])
@@ -592,9 +596,8 @@ def _of_day(
         return _on_a_date(seconds, options, [text], written)
     warnings = ["the times are marked as UTC but read as local, like the program's file names"]
     if hours:
-        warnings.append(
-            f"the times are {hours:+d} h from the start in the summary next to the log: corrected, and read as local"
-        )
+        text = f"the times are {hours:+d} h from the start in the summary next to the log"
+        warnings.append(f"{text}: corrected, and read as local")
     return _on_a_date(seconds - 3600.0 * hours, options, warnings)
 
 

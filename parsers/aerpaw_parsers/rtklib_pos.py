@@ -19,7 +19,7 @@ _N = r"[\s,]+(-?\d{1,9}\.\d{1,12})"
 # Day or GPS week, clock or second of the week, latitude, longitude, height, quality, satellites.
 _CLOCK = r"[\s,]+(\d\d:\d\d:\d\d(?:\.\d{1,9})?|\d{1,6}\.?\d{0,9})"
 _ROW = re.compile(r"\s*(\d{4}(?:/\d\d/\d\d)?)" + _CLOCK + 3 * _N + r"[\s,]+(\d)[\s,]+(\d{1,3})\b.*")
-_FIX = dict(zip("123456", "653438", strict=True))
+_FIX = dict(zip("0123456", "0653438", strict=True))
 
 
 def sniff(head: bytes) -> bool:

@@ -17,6 +17,22 @@ _END_DBM = -140.0
 _RANGE_DBM = (-170.0, -1.0)
 
 
+# The smallest number of rows that show a statistic, and the largest relative size of its steps.
+_SHOWN_ROWS, _SMOOTHER = 12, 0.6
+
+
+def is_statistic_of(level: FloatArray, other: FloatArray) -> bool:
+    """Check whether a column is a running mean, minimum or maximum of a level: smoother, and near or at its end."""
+    both = np.isfinite(level) & np.isfinite(other)
+    level, other = level[both], other[both]
+    if len(level) < _SHOWN_ROWS or np.std(np.diff(other)) >= _SMOOTHER * np.std(np.diff(level)):
+        return False
+    apart, step_db = other - level, np.std(np.diff(level))
+    follows = abs(np.median(apart)) < step_db / 2 and np.std(apart) < step_db
+    touches = 0 < (np.abs(apart) < 0.1).mean() < 1 and (apart.min() > -0.1 or apart.max() < 0.1)
+    return bool(follows or touches)
+
+
 class Reading(NamedTuple):
     """The levels of one cell in one row, a row of the table for :func:`streams`.
 

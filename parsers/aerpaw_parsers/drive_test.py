@@ -22,11 +22,9 @@ from itertools import compress
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import dictionary
-from aerpaw_cmp.readers import Attribute, Reader, ReadOptions, ReadResult, Rows, Stream, checked_ranks, snr_stream
+from aerpaw_cmp.logs.rows import Rows, checked_ranks, snr_stream
+from aerpaw_cmp.readers import Attribute, InputError, Reader, ReadOptions, ReadResult, Stream, counted, dictionary
 
 from . import _cells, _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
 
@@ -106,7 +104,7 @@ class _Cell:
         return [column for name, column in self.columns.items() if name not in _IDENTITY]
 
 
-_IDENTITY = ("pci", "arfcn")
+_IDENTITY, _PCI = ("pci", "arfcn"), next(row for row in dictionary.QUANTITIES if row.name == "PCI")
 # Columns are separate series if they repeat a cell of their row in more than this share of the rows.
 _TWICE = 0.3
 # Prefixes of places with a secondary carrier, which is always a separate cell.
@@ -165,8 +163,18 @@ _FIELDS = {quantity: name for name, quantity in _cells.QUANTITIES.items()}
 
 
 def _part(sheet: _sheet.Sheet, column: int) -> str:
-    meaning = sheet.meanings[column]
-    return "" if meaning is None else meaning.part
+    """Return the part of the level in a column, ``mean`` also for a statistic of another level by its values."""
+    own = sheet.meanings[column]
+    if own is None or own.part or own.quantity.role != "rss" or own.indirect:
+        return own.part if own else ""
+    named = {m.place for m in sheet.meanings if m and (m.quantity.name == "PCI" or m.quantity.role == "mark")}
+    like = {i: m for i, m in enumerate(sheet.meanings) if m and (m.quantity, m.rat) == (own.quantity, own.rat)}
+    free = [i for i, what in like.items() if what.place in {"serving", *({*_UNNAMED} - named)}]
+    raw = [i for i in free if column in free and _cells.is_statistic_of(sheet.numbers(i), sheet.numbers(column))]
+    if raw:
+        text = f"its values are a statistic of {sheet.names[raw[0]]!r}, such as a mean: read as a KPI"
+        sheet.notes[column] = f"column {sheet.names[column]!r}: {text}"
+    return "mean" if raw else ""
 
 
 def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
@@ -223,8 +231,8 @@ def _readings(
         level = sheet.numbers(cell.columns["rsrp_dbm"])
         values = {name: _or_nan(sheet, cell.columns.get(name), len(level)) for name in _FIELDS.values()}
         none = np.isnan(values["rsrp_dbm"]) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
-        # a table with mostly fractions was refused before: a fraction here is a single damaged cell
-        pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # identities are integers
+        # a table with mostly impossible numbers was refused before: such a number here is a single damaged cell
+        pci = np.where(dictionary.impossible(_PCI, values["pci"]), np.nan, values["pci"])
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {
             "row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle,
@@ -416,8 +424,8 @@ def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
 def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
     """Check whether a column is the mean of a level that is another column of the table, or one of several means."""
     own = sheet.meanings[column]
-    if own is None or own.part != "mean":
-        return False
+    if own is None or not own.part:
+        return _part(sheet, column) == "mean"
     others = (what for what in sheet.meanings if what is not None and what is not own and not what.indirect)
     return any(
         (m.quantity, m.rat, m.place) == (own.quantity, own.rat, own.place)
@@ -432,9 +440,7 @@ def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
         return False
     if not words & {"rnti", "ue", "nprb", "prb", "prbs"}:
         return False
-    rows.warnings.append(
-        "the table is from an uplink scheduler: its signal-to-noise ratios are not levels of the downlink"
-    )
+    rows.warnings.append("the table is from an uplink scheduler: its SNRs are not levels of the downlink")
     return True
 
 
@@ -449,6 +455,8 @@ def _numbers_cells(rows: Rows, sheet: _sheet.Sheet, column: int) -> bool:
     return True
 
 
+# Places of levels that no name of a neighbour, carrier, device or tower describes.
+_UNNAMED = ("serving", *(f"cell{i}" for i in range(100)))
 # Smallest share of times at which an order of cells is complete.
 _NUMBERED = 0.8
 
@@ -478,11 +486,16 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
             if listed:
                 shown = ", ".join(repr(sheet.names[i]) for i in listed)
                 rows.warnings.append(f"the level of the cell is {level!r}; read as {what}: {shown}")
-        # the header has one name twice: the second of them is called "RSRP 2"
-        repeated = [name for i in others if re.fullmatch(re.escape(level) + r" \d+", name := sheet.names[i])]
-        if repeated:
-            shown = " and ".join(map(repr, [level, *repeated]))
-            rows.warnings.append(f"{shown} are separate series: the table does not specify whose levels they are")
+    alike: dict[tuple[str, str], list[str]] = {}
+    for i in (*(cell.columns["rsrp_dbm"] for cell in cells if not cell.marks), *others):
+        m = sheet.meanings[i]
+        if m and m.quantity.role == "rss" and m.place in _UNNAMED and not (m.indirect or _part(sheet, i)):
+            alike.setdefault((m.quantity.name, m.rat), []).append(sheet.names[i])
+    for names in alike.values():
+        # a header may have one name twice: the second of them is called "RSRP 2"
+        if len(names) > 1 and not all(re.search(r"\d", name) for name in names):
+            text = "are separate series: the table does not specify whose levels they are"
+            rows.warnings.append(f"{' and '.join(map(repr, names))} {text}")
 
 
 def _assumed_units(sheet: _sheet.Sheet) -> Iterator[str]:

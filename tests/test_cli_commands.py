@@ -30,7 +30,7 @@ def test_ingest_takes_the_sample_folder(tmp_path: Path, capsys: pytest.CaptureFi
     assert len(summary["files"]) == 12
     for file in summary["files"]:
         assert file["lines"] == file["accepted"] + file["rejected"] + file["blank"]
-        assert set(file["streams"][0]) == {"kind", "name", "rows", "start", "end", "rate_hz"}
+        assert set(file["streams"][0]) == {"kind", "name", "rows", "start", "end", "rate_hz", "attributes"}
     assert {Path(s["path"]).name for s in summary["skipped"]} == {"flight.yaml", "truth.json"}
     from aerpaw_cmp.logs.flight_file import read_flight
 

@@ -602,10 +602,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
             "rejected": file.result.rejected_count,
             "first_rejected": [asdict(line) for line in file.result.rejected[:_FIRST_REJECTED]],
             "blank": file.result.blank,
-            "streams": [
-                {"kind": stream.kind, "name": stream.name, "rows": stream.rows, **_span(stream)}
-                for stream in file.result.streams
-            ],
+            "streams": [_entry(stream) for stream in file.result.streams],
             "warnings": list(file.result.warnings),
         }
         for file in files
@@ -615,15 +612,16 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
     return {"files": entries, "skipped": skipped, "warnings": warnings}
 
 
-def _span(stream: Stream) -> dict[str, Any]:
-    """Return the first and last time (ISO, UTC) and the mean rate, or None for undefined values."""
-    if not stream.rows:
-        return {"start": None, "end": None, "rate_hz": None}
-    time = stream.frame["time"]
-    start, end = time.min(), time.max()
-    seconds = (end - start).total_seconds()
-    rate = (stream.rows - 1) / seconds if seconds > 0 else None
-    return {"start": start.isoformat() + "Z", "end": end.isoformat() + "Z", "rate_hz": rate}
+def _entry(stream: Stream) -> dict[str, Any]:
+    """Return a stream with its first and last time (ISO, UTC) and mean rate, which are None if they are undefined."""
+    entry: dict[str, Any] = {"kind": stream.kind, "name": stream.name, "rows": stream.rows}
+    start, end, rate = None, None, None
+    if stream.rows:
+        first, last = stream.frame["time"].min(), stream.frame["time"].max()
+        seconds = (last - first).total_seconds()
+        start, end = first.isoformat() + "Z", last.isoformat() + "Z"
+        rate = (stream.rows - 1) / seconds if seconds > 0 else None
+    return {**entry, "start": start, "end": end, "rate_hz": rate, "attributes": dict(stream.attributes)}
 
 
 def account_notes(account: Mapping[str, Any]) -> list[str]:

@@ -65,10 +65,11 @@ def test_summary_is_the_contract(folder: Path) -> None:
     assert {"path", "reader", "lines", "accepted", "rejected", "blank", "streams"} <= set(entry)
     assert (entry["lines"], entry["accepted"], entry["rejected"], entry["blank"]) == (3, 3, 0, 0)
     (stream,) = entry["streams"]
-    assert list(stream) == ["kind", "name", "rows", "start", "end", "rate_hz"]
+    assert list(stream) == ["kind", "name", "rows", "start", "end", "rate_hz", "attributes"]
     assert (stream["kind"], stream["name"], stream["rows"]) == ("telemetry", "vehicle", 3)
     assert pd.Timestamp(stream["start"]) == pd.Timestamp("2025-03-02T15:00:00.25Z")
     assert stream["rate_hz"] == pytest.approx(1.0)
+    assert stream["attributes"] == dict(ingested[1].result.streams[0].attributes)
     assert any("no_fix" in text and "vehicle.txt" in text for text in answer["warnings"])
 
 
@@ -361,7 +362,11 @@ def test_links_in_a_folder_are_told(tmp_path: Path) -> None:
     ("column", "level", "said"),
     [
         ("rssi_0.1dBm", "-724", "rssi_0_1dbm': all 5 levels are below the floor of the reader"),
-        ("E (dBuV/m)", "60.3", "not read, though they look like levels, identities, positions or times: 'E (dBuV/m)'"),
+        (
+            "E (dBuV/m)",
+            "60.3",
+            "not read, though they look like levels, identities, positions, times or flags: 'E (dBuV/m)'",
+        ),
         ("rsrp_dbm", "-80", "the dates begin on 2004-09-17: if the week number of the GPS receiver rolled over"),
     ],
 )

@@ -218,7 +218,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     if place == "serving" and (other := PATTERNS["other"].search(text)):
         place = (other[1] or other[2] or f"cell{other[3]}").replace(" ", "")
     part = "mean" if PATTERNS["mean"].search(text) else "port" if PATTERNS["port"].search(text) else ""
-    return Meaning(row, unit, rat, place, indirect=PATTERNS["indirect"].search(text) is not None, part=part)
+    return Meaning(row, unit, rat, place, indirect=has("indirect", text), part=part)
 
 
 # Words that are ignored when the names of an identity and a level are paired: statistics, radio access, serving cell.
@@ -278,7 +278,7 @@ def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning |
             several = any(shared[rest] & rats for other, rats in shared.items() if other != rest)
             # a "target" with an identity is the target cell of a handover; without an identity, it is the target of a
             # model
-            indirect = what.indirect and PATTERNS["indirect"].search(rest.replace("target", "")) is not None
+            indirect = what.indirect and has("indirect", rest.replace("target", ""))
             what = replace(what, place=f"cell {rest}" if several and rest else what.place, indirect=indirect)
         placed.append(what)
     return placed
@@ -473,9 +473,7 @@ AERPAW_MAT = next(known for known in PROGRAMS if known.name == "AERPAW .mat")
 
 def names_a_cell(words: str, *, alone: bool = False) -> bool:
     """Check whether a plain name names a cell, an antenna or a beam, without other words if ``alone``."""
-    return PATTERNS["of_a_cell"].fullmatch(words) is not None or (
-        not alone and PATTERNS["cell_id"].search(words) is not None
-    )
+    return PATTERNS["of_a_cell"].fullmatch(words) is not None or (not alone and has("cell_id", words))
 
 
 def like_levels(names: Iterable[str]) -> list[str]:
@@ -487,6 +485,11 @@ def like_levels(names: Iterable[str]) -> list[str]:
         if PATTERNS["like_a_level"].search(text) and not PATTERNS["unlike_a_level"].search(text)
         and not (electric and re.fullmatch(r"(.* )?(power|pwr)( m?w)?", text))
     ]  # fmt: skip
+
+
+def has(kind: str, words: str) -> bool:
+    """Check whether plain words contain the pattern of a kind, such as ``gain``."""
+    return PATTERNS[kind].search(words) is not None
 
 
 def is_statistic(name: str) -> bool:

@@ -296,6 +296,7 @@ def _way_out(head: bytes) -> str:
     return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 
+_CLOCK = re.compile(r"\d{4}.*\d:\d\d")
 _NEGATIVE = re.compile(r'[ "]*-\d{1,3}(\.\d*)?[ "]*')
 
 
@@ -311,11 +312,13 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
         if not known[i] and rows and all(_NEGATIVE.fullmatch(row[i]) for row in rows)
         and not dictionary.PATTERNS["unlike_a_level"].search(dictionary.plain(name))
     ]  # fmt: skip
+    times = [name for i, name in enumerate(names) if rows and all(_CLOCK.search(row[i]) for row in rows)]
     names = [name for name in names if not re.search(elsewhere, dictionary.plain(name))]
     fits = {
         what: [name for words in forms for name in names if re.search(words, dictionary.plain(name))]
         for what, forms in dictionary.HINTS.items()
     } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)] or levels}
+    fits["time"] = fits["time"] or times
     fits["rss_db"].sort(key=lambda name: dictionary.without_unit(name)[1] != "dbm")
     if fits["time"] and {"roll_deg", "pitch_deg"} <= {what.quantity.name for what in known if what}:
         return "angles without positions: write them into the table of the positions, at the same times"
@@ -325,7 +328,7 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
     if not (fits["latitude_deg"] and fits["longitude_deg"]):
         fits = {what: fits[what] for what in ("time", "rss_db")}
     pairs = [f"--map {named[0]!r}={what}" for what, named in fits.items() if named]
-    others = f" (or {', '.join(map(repr, fits['rss_db'][1:4]))})" if fits["rss_db"][1:] else ""
+    others = f"; other columns: {', '.join(map(repr, fits['rss_db'][1:4]))}" if fits["rss_db"][1:] else ""
     return f"a table of another kind: name its columns: {' '.join(pairs)}{others}"
 
 

@@ -157,7 +157,7 @@ def cell_columns(sheet: _sheet.Sheet, *, nr: bool | None = None) -> list[int]:
     columns = [
         i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and dictionary.names_a_cell(words, alone=True)
     ]
-    return [i for i in columns if (dictionary.PATTERNS["nr"].search(sheet.plain[i]) is not None) is nr] or columns
+    return [i for i in columns if dictionary.has("nr", sheet.plain[i]) == nr] or columns
 
 
 def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int], level: int | None) -> list[int]:
@@ -181,7 +181,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
     unknown = [
         i
         for i, m in enumerate(sheet.meanings)
-        if m is None and i not in marks and not dictionary.PATTERNS["no_identity"].search(sheet.plain[i])
+        if m is None and i not in marks and not dictionary.has("no_identity", sheet.plain[i])
     ]
     found: list[int] = []
     while (repeated := table.duplicated().mean()) >= _REPEATED:

@@ -175,12 +175,12 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     if datum == "unknown":
         known = sheet.program.datum if sheet.program is not None else ""
         rows.height_from, datum = ("program", known) if known else ("assumed", datum)
-        for i in (i for i, name in enumerate(sheet.plain) if _OF_DATUM.fullmatch(name)):
+        for i in (i for i, name in enumerate(sheet.plain) if dictionary.PATTERNS["of_datum"].fullmatch(name)):
             said = {dictionary.meaning(f"altitude {text}") for text in sheet.texts(i)}
             if len(said) == 1 and (one := said.pop()) is not None and one.quantity.datum not in ("", "unknown"):
                 rows.height_from, datum = "written", one.quantity.datum
     height, time_s = sheet.numbers(column), (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
-    home = next((i for i, words in enumerate(sheet.plain) if _OF_HOME.fullmatch(words)), None)
+    home = next((i for i, words in enumerate(sheet.plain) if dictionary.PATTERNS["of_home"].fullmatch(words)), None)
     if datum in ("sea level", "unknown") and home is not None and (is_set := sheet.numbers(home) > UNSET_M).any():
         home_m, lowest_m = sheet.numbers(home)[is_set], np.nanmin(height, initial=np.inf)
         # heights of an unknown datum may count from home already
@@ -203,10 +203,6 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
 
 
 _IMPERIAL = ("mph", "ft", "feet", "foot", "ft/s")
-# Columns of the altitude of the home point, but not of the height of a return to home.
-_OF_HOME = re.compile(r"(home|take ?off|launch)( point)? (alt|altitude|elevation|msl|amsl)( (msl|amsl))?( m| ft)?")
-# Columns that name the datum of the heights.
-_OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type|datum|mode|frame)( frame)?")
 # Home has moved if its altitude changes by more than ``MOVED_M``; an aircraft has taken off if it climbs by ``_OFF_M``.
 MOVED_M, _OFF_M = 0.5, 2.0
 # A home this close to sea level [m] is not set: the two heights of a record are then equal, except for rounding.

@@ -447,18 +447,23 @@ class Sheet:
         idle = {i for i, _ in enumerate(self.names) if i not in self.used and self.unit(i) in dictionary.ACROSS_50_OHM}
         said = [text for i, text in sorted(self.notes.items()) if i not in idle]
         if left:
-            said.append(f"not read, though they look like levels, identities, positions or times: {shown}{more}")
+            said.append(f"not read, though they look like levels, identities, positions, times or flags: {shown}{more}")
         words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
         if words:
             shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
             text = "If one names the cell or device of a row, call it 'cell' or 'device' (or --map NAME=cell)"
             said.append(f"not read: {shown}. {text}")
-        gains = [i for i in left if _GAIN.search(self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
+        gains = [i for i in left if dictionary.has("gain", self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         if gains:
             text = "changes, and levels are not corrected for it: do they already include it?"
             said.append(f"column {self.names[gains[0]]!r} {text}")
-        above = [self.lines.text(i) for i in range(min(int(self.row[0]), TITLES) if len(self) else 0)]
-        said += [f"above the table, but not read: {text.strip()[:80]!r}" for text in above if _UNITS_ABOVE.match(text)]
+        beside = {i: self.lines.text(i).strip('#%;" ') for i in self.blank_rows.tolist() if len(self)}
+        said += [
+            f"line {i + 1} is not read: {text[:80]!r}"
+            for i, text in beside.items()
+            if dictionary.has("of_values", text)
+            and not (TITLES <= i < self.row[-1] or text.startswith(self.names[0] or "?"))
+        ]
         equal = len(self) - len({*map(tuple, self.cells)})
         if equal > _MOST_EQUAL * len(self):
             said.append(f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?")
@@ -471,21 +476,18 @@ class Sheet:
         if meaning is not None:
             like |= meaning.quantity.role in _OF_INTEREST
         elif not like:
-            like = (
-                dictionary.PATTERNS["where_or_when"].search(words) is not None
-                or self.unit_read(column) in _OF_LEVELS[1:]
-            )
+            like = dictionary.has("where_or_when", words) or self.unit_read(column) in _OF_LEVELS[1:]
             # Android's index of a level (ASU) counts as a level if no other level is read
             levels = (what for i in self.used if (what := self.meanings[i]) and what.quantity.role == "rss")
-            like |= _ASU.search(words) is not None and not any(levels)
-            like |= dictionary.PATTERNS["neighbour"].search(words) is not None
+            like |= "asu" in words.split() and not any(levels)
+            like |= dictionary.has("neighbour", words)
             # angles in columns of other names, such as x and y
             like |= self.find("latitude_deg") is None and _is_angle(self.numbers(column))
         return like and any(text.lower() not in NO_VALUE for text in self.texts(column))
 
     def _may_name(self, column: int) -> bool:
         """Check whether a column with an unknown name has a few texts or numbers that may name cells or devices."""
-        if self.meanings[column] is not None or dictionary.PATTERNS["no_identity"].search(self.plain[column]):
+        if self.meanings[column] is not None or dictionary.has("no_identity", self.plain[column]):
             return False
         texts = {text.lower() for text in self.texts(column)} - {*NO_VALUE, *_YES_OR_NO}
         if not 1 < len(texts) <= _MOST_SOURCES:
@@ -494,22 +496,16 @@ class Sheet:
             return all(_LETTER.search(text) and math.isnan(_number(text)[0]) for text in texts)
         # unlike waypoints and heights, numbers of cells are neither consecutive nor round; unlike counts, they are few
         numbers = np.unique([int(text) for text in texts])
-        called = _CALLED.search(self.plain[column])
+        called = dictionary.has("called", self.plain[column])
         like = called or (np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any() and self.find("PCI") is None)
         known = {what.quantity.role for i in self.used if (what := self.meanings[i])}
         levels = like and ("rss" in known or {*map(self.unit_read, self.used)} & {*_OF_LEVELS[1:]})
         return bool(levels and len(numbers) <= min(_MOST_NUMBERS, len(self) / 3))
 
 
-_CALLED = re.compile(r"id\b|\b(unit|cc|chain|scell|no|num(ber)?)\b")
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
-_ASU = re.compile(r"\basu\b")
-# Gains of a receiver, not those of an antenna or a transmitter.
-_GAIN = re.compile(r"^(?!.*\b(tx|transmit\w*|ant|antenna)\b).*\b(gain|agc|atten(uation|uator)?)\b")
 # Largest share of rows that are equal to another row: rows within one second may be equal.
 _MOST_EQUAL = 0.3
-# A comment about units or the clock, which belongs to all columns.
-_UNITS_ABOVE = re.compile(r"(?i)\W*[#%;].*\b(feet|ft|inch|miles|knots|dbuv|dbw|mw|utc ?[+-]|offset|local time)")
 _YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
 # Names contain a letter. A column with more different texts or numbers than this does not name cells or devices.
 _LETTER, _MOST_SOURCES, _MOST_NUMBERS = re.compile(r"[^\W\d_]"), 50, 8
@@ -1002,7 +998,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         texts = [" ".join(pair) for pair in zip(texts, sheet.texts(half[0]), strict=True)]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
     count = next((short for short, c in _text.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
-    if _ELAPSED.search(name):
+    if dictionary.has("elapsed", name):
         texts, count = [_stamps.in_seconds(text) for text in texts], count or "s"
     count = count or ("s" if unit else None)
     written = dictionary.without_unit(sheet.names[column])[1] or any(c.said.search(name) for c in _text.COUNTS.values())
@@ -1031,7 +1027,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     gps = re.search(r"\bgps", name) is not None
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
-    european = sheet.has_decimal_commas or f"{options.timezone}".startswith("Europe/") or _EUROPEAN.search(heads)
+    european = sheet.has_decimal_commas or dictionary.has("european", heads) or f"{options.timezone}"[:7] == "Europe/"
     read = partial(
         _stamps.read, unit=count, european=bool(european), zone=zone, gps=gps,
         day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
@@ -1077,7 +1073,6 @@ def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options
 
 
 # Names of times since the start of a log, which may be written like times of the day.
-_ELAPSED = re.compile(r"^(rel|relative|elapsed|up) ?time")
 _ZONED = re.compile(r":\d\d(?:\.\d+)?(?:Z|[+-]\d\d:?\d\d)$")
 # Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
@@ -1085,8 +1080,6 @@ _CLOCK = re.compile(r"\d{4}-\d\d-\d\d.\d\d:\d\d")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 # A cell of a column that contains only AM or PM.
 _AM_PM = re.compile(r"[AaPp]\.?[Mm]\.?")
-# Words for times in languages of countries where the day comes first.
-_EUROPEAN = re.compile(r"zeit|datum|fecha|hora|heure|horodatage")
 # The order in a name: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
@@ -1128,7 +1121,7 @@ def _has_levels(sheet: Sheet, column: int) -> bool:
     """Check whether the numbers of a column look like levels in dBm, such as those of a column named by a tower."""
     known = sheet.numbers(column)[np.isfinite(sheet.numbers(column))]
     like = len(known) > 1 and (known < -30).mean() > 0.9 and known.min() > -150
-    return bool(like and not dictionary.PATTERNS["unlike_a_level"].search(sheet.plain[column]))
+    return bool(like and not dictionary.has("unlike_a_level", sheet.plain[column]))
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:

@@ -171,6 +171,14 @@ def _match(text: str) -> re.Match[str] | None:
     return next(known, None)
 
 
+# AT+CCLK of a modem: the zone counts quarters of an hour (3GPP TS 27.007, 8.15).
+_OF_MODEM = re.compile(r"(\d\d/\d\d/\d\d,\d\d:\d\d:\d\d[+-])(\d\d)")
+
+
+def _with_hours(match: re.Match[str]) -> str:
+    return f"{match[1]}{int(match[2]) // 4:02d}:{int(match[2]) % 4 * 15:02d}"
+
+
 def is_dated(text: str) -> bool:
     """Check whether a time contains its date, like an epoch or a date with a clock.
 
@@ -346,6 +354,8 @@ def read(
         for text in texts
     ]
     shown = _padded(shown)
+    of_modem = any(map(_OF_MODEM.fullmatch, shown))
+    shown = [_OF_MODEM.sub(_with_hours, text) for text in shown] if of_modem else shown
     filled = [text for text in shown if text]
     compact = [match for text in filled if (match := _COMPACT.fullmatch(text))]
     # in counts of seconds these digits reach 60 to 99, in times of the day they never do
@@ -363,6 +373,7 @@ def read(
         return _of_day(shown, options, zone, device)
     plain = [text for text in filled if not _COMMON.fullmatch(text)]
     order, warnings = _order(plain, options.file_name, european=european, day_first=day_first)
+    warnings += ["the zone of the times is read in quarters of an hour, as AT+CCLK of a modem writes it"] * of_modem
     bare = [match for text in plain if (match := _match(text)) and match.groupdict().get("second") is None]
     if len(set(filled)) < len(filled) and 2 * len(bare) > len(filled):
         warnings.append("the times have no seconds (saved by a spreadsheet?): all rows of a minute share one time")

@@ -74,13 +74,12 @@ _NARROWER = (nemo_csv, quectel_ri, ardupilot_bin, rtklib_pos, vehicle_out)
 
 def _is_table(head: bytes, header: _IsHeader) -> bool:
     """Check whether a file begins with a header of this kind and is not of a more specific format."""
-    narrower = _is_snr_of_towers(head) or any(module.READER.sniff(head) for module in _NARROWER)
+    narrower = _SNR_OF_TOWERS.match(head) or any(module.READER.sniff(head) for module in _NARROWER)
     return not narrower and _sheet.starts(head, header)
 
 
-def _is_snr_of_towers(head: bytes) -> bool:
-    """Check whether a file begins with the header of AADM's SNR table, ``time,snr_lw1,snr_lw2``."""
-    return re.match(rb"(?i)(?:\xef\xbb\xbf)?time(?:,snr_[a-z0-9]{1,12}){1,16}[ \t]*\r?\n", head) is not None
+# The header of AADM's table of SNR, ``time,snr_lw1,snr_lw2``.
+_SNR_OF_TOWERS = re.compile(rb"(?i)(?:\xef\xbb\xbf)?time(?:,snr_[a-z0-9]{1,12}){1,16}[ \t]*\r?\n")
 
 
 @dataclass
@@ -554,7 +553,7 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
 
 def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     ri = sheet.numbers(column)
-    flag, zero = rows.flag.copy(), _FROM_ZERO.search(sheet.plain[column]) is not None
+    flag, zero = rows.flag.copy(), dictionary.has("from_zero", sheet.plain[column])
     none = (ri == 0) & (not zero)
     values = {"rank": checked_ranks(ri + zero, flag, none=none, means=True), "ri_raw": ri}
     name, cqi = re.sub(r"\W+", "_", sheet.plain[column]), sheet.find("CQI")
@@ -572,7 +571,6 @@ def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
 
 # Largest share of rows without a report, and the largest number of receive ports of a phone or modem.
 _MOST_IDLE, _MOST_PORTS = 0.1, 4
-_FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero)\b")
 
 
 def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
@@ -609,6 +607,7 @@ READERS = (
     ),
     Reader(
         name="aadm_snr", kinds=("rss",), title="SNR of several towers, CSV (AADM)", sample="time,snr_lw1,snr_lw2",
-        sniff=_is_snr_of_towers, read=partial(_read, header=is_header, reader="aadm_snr"),
+        sniff=lambda head: _SNR_OF_TOWERS.match(head) is not None,
+        read=partial(_read, header=is_header, reader="aadm_snr"),
     ),
 )  # fmt: skip

@@ -197,10 +197,15 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,
         "--map 'when_utc'=time --map 'rx_power_dbm'=rss_db$"),
     "channels of a receiver": (
-        table("time,temp,USRP1,USRP2", EPOCH + ",-5,{l},{l}"), InputError, "--map 'USRP1'=rss_db .or 'USRP2'.$"),
+        table("time,temp,USRP1,USRP2", EPOCH + ",-5,{l},{l}"), InputError, "--map 'USRP1'=rss_db; other columns: 'USRP2'$"),
     "two powers of nobody": (
         table("elapsed_time,utc_stamp,node,raw_dbfs,cal_dbm", f"{{i}},{EPOCH},A,{{l}},{{l}}"), InputError,
-        "--map 'cal_dbm'=rss_db .or 'raw_dbfs'.$"),
+        "--map 'cal_dbm'=rss_db; other columns: 'raw_dbfs'$"),
+    "times under an unknown name": (
+        table("Horário (GMT-03:00),RSRP (dBm)", "2025-06-10 10:00:0{i},{l}"), InputError, "--map 'Horário .GMT-03:00.'=time"),
+    "the height of a gateway": (
+        table("when_utc,node_lat,node_lon,gw_lat,gw_lon,gw_alt_m,packet_rssi", EPOCH + f",{PLACE},{PLACE},450,{{l}}"),
+        InputError, "'node_lat'=latitude_deg --map 'node_lon'=longitude_deg --map 'packet_rssi'=rss_db$"),
     "a table in another encoding": ("time,\udc93\udcfa\udc8e\udc9e\n1,2\n", InputError, "another encoding than UTF-8"),
     "angles without positions": (
         table("time,roll,pitch,yaw", EPOCH + ",1.5,2.5,90"), InputError, "angles without positions"),

@@ -622,7 +622,23 @@ class FlightFile(StrictModel):
         learned: Mapping[str, Named] | None = None,
         lent: Iterable[str] = (),
     ) -> FlightFile:
-        """Return a copy of the settings with new values for some top-level keys, which are not checked."""
+        """Return a copy of the settings with new values for some top-level keys, which are not checked.
+
+        Parameters
+        ----------
+        content : mapping
+            New values by key.
+        cautions : iterable of Caution, optional
+            New warnings about named learned models. None: those of these settings.
+        learned : mapping of str to Named, optional
+            New learned models by key of ``antennas``. None: those of these settings.
+        lent : iterable of str
+            Further channels that this flight may not have.
+
+        Returns
+        -------
+        FlightFile
+        """
         other = self.model_copy(update=dict(content))
         other._cautions = self._cautions if cautions is None else tuple(cautions)
         other._learned = self._learned if learned is None else learned

@@ -358,6 +358,14 @@ def with_nugget(d):
     return 0.9 * np.exp(-np.asarray(d) / 70.0)  # a tenth is nugget
 
 
+def test_a_missing_repeat_of_a_sample_leaves_the_other_one():
+    points, target = np.array([[0.0, 0.0], [0.0, 0.0], [40.0, 0.0], [0.0, 40.0]]), [[10.0, 5.0]]
+    values = np.array([[1.0, 5.0], [np.nan, 7.0], [2.0, 2.0], [3.0, 3.0]])
+    estimate, _ = OrdinaryKriging(exponential).fit(points, values).predict(target)
+    kept, _ = OrdinaryKriging(exponential).fit(points[[0, 2, 3]], values[[0, 2, 3], 0]).predict(target)
+    assert estimate[0, 0] == pytest.approx(kept[0], rel=1e-12)
+
+
 def by_hand(points, values, target, sill, *, neighbours, radius, outside="nan"):
     """Estimate and variance at one target."""
     known = np.isfinite(values)

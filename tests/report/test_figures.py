@@ -309,3 +309,8 @@ def test_names_of_towers_stay_inside_the_plan() -> None:
     (credit,) = (text.get_window_extent() for text in ax.texts if text.get_gid() == "credit")
     assert len(names) == 5
     assert all(ax.bbox.padded(2).contains(*name.max) and not name.overlaps(credit) for name in names)
+
+
+def test_a_pose_without_a_position_does_not_change_the_shape_of_a_plan():
+    east, north = np.array([0.0, np.nan, 60.0, 30.0]), np.array([0.0, 90.0, 20.0, np.nan])
+    assert canvas.plan_shape(east, north) == pytest.approx(120.0 / 80.0)  # 60 m x 20 m, with 30 m around

@@ -235,3 +235,7 @@ def test_a_great_circle_at_several_frequencies(tmp_path):
     assert np.allclose(pattern.gain_dbi(down, np.full(3, np.pi)), 3 * np.cos(down) - 2, atol=0.05)
     with pytest.raises(InputError, match="2 frequencies"):
         read_pattern_file(file)
+    # 12 of 121 rows of each frequency: a gap of 39 degrees, over which a gain would be invented
+    file.write_text("\n".join([head, *rows[:40], *rows[52:161], *rows[173:]]) + "\n")
+    with pytest.raises(InputError, match=r"109 angles at 3300 MHz"):
+        read_pattern_file(file, carrier_hz=3.3e9)

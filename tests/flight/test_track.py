@@ -350,3 +350,8 @@ def test_velocity_is_the_central_difference_and_bridges_no_gap():
     assert velocity[5:15, 2] == pytest.approx(time[5:15])  # exact for constant acceleration
     assert np.isnan(velocity[-1]).all()
     assert np.isnan(velocities_mps(np.zeros(4), position[:4])).all()
+
+
+def test_a_single_row_without_a_velocity_stands_still():
+    logged = np.array([[3.0, np.nan, np.nan]])
+    assert tracks._velocities(np.zeros(1), np.zeros((1, 3)), logged).tolist() == [[3.0, 0.0, 0.0]]

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -16,6 +17,8 @@ from aerpaw_cmp.logs import ingest as room
 from aerpaw_cmp.logs.flight_file import write_flight
 from aerpaw_cmp.logs.ingest import Ingested, account_notes, ingest, read_log, summary
 from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.rows import Rows
 from tests.parsers.samples import OPTIONS, SAMPLES
 
 VEHICLE = SAMPLES["vehicle_out"]["ten_fields"][0]
@@ -400,3 +403,9 @@ def test_heights_that_count_downwards_are_reported(tmp_path: Path) -> None:
     path.write_text("\n".join(["time,lat,lon,height_above_takeoff_m,rsrp", *rows]) + "\n")
     (file,) = ingest([path])
     assert any("40 m below the take-off: do they count downwards" in text for text in file.result.warnings)
+
+
+def test_three_series_of_one_name_are_three_series() -> None:
+    rows = Rows("r", ReadOptions(), 1, np.zeros(1, int), np.zeros(1, "datetime64[ns]"), np.array([""], object))
+    stream = Stream("rss", "x", pd.DataFrame({"time": rows.time, "line": [1], "flag": [""], "rss_db": [-70.0]}))
+    assert [series.name for series in rows.result([stream] * 3).streams] == ["x", "x_again1", "x_again2"]

@@ -22,7 +22,7 @@ import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn, TypeVar
 from zoneinfo import available_timezones
@@ -134,7 +134,15 @@ def load_yaml_and_lines(path: str | Path, model: type[ModelT]) -> tuple[ModelT, 
 
     Use it for checks that need more than the file, if their messages must contain the line.
     """
-    document = _parse(_read_text(Path(path)), path)
+    settings: tuple[ModelT, LineOf] = _known(_read_text(Path(path)), str(path), model)
+    return settings
+
+
+# the text is an argument, so that an edited file is parsed again
+@lru_cache(maxsize=16)
+def _known(text: str, path: str, model: type[Any]) -> tuple[Any, LineOf]:
+    """Return settings and lines of a text, cached because one command, and each task of a campaign, requests them."""
+    document = _parse(text, path)
     return _checked(document, model, path), document.line
 
 

@@ -372,7 +372,7 @@ def run_site_import(
     force : bool
         Replace a file that this tool did not write.
     **options
-        For :func:`~aerpaw_cmp.site.footprints.import_site`: ``dem``, ``dem_crs``, ``untagged``, ``trees``.
+        Further options of :func:`~aerpaw_cmp.site.footprints.import_site`, such as ``dem``.
 
     Returns
     -------

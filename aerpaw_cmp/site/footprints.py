@@ -27,6 +27,7 @@ from shapely.geometry.base import BaseGeometry
 from ..common.errors import InputError, UsageError, about_file, one_line
 from ..common.geodesy import SiteFrame
 from ..common.grouping import lists_by_key
+from ..common.stages import Progress, logged
 from ..common.text import counted
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
@@ -86,6 +87,9 @@ _ROW_SPACING_M = 10.0
 
 _MAXIMUM_ROW_TREES = 10_000
 
+# Progress is reported each time so many outlines are read: a second on a slow machine.
+_OUTLINES_PER_REPORT = 1000
+
 
 @dataclass(slots=True)
 class Footprints:
@@ -138,6 +142,7 @@ def import_footprints(
     untagged: mapfiles.Kind | None = None,
     trees: bool = False,
     area_m: tuple[float, float, float, float] | None = None,
+    progress: Progress = logged,
 ) -> Footprints:
     """Return the outlines of map files as records of the site.
 
@@ -153,6 +158,8 @@ def import_footprints(
         True if forests become single trees at random positions. By default they are media with a height.
     area_m : (east_min, east_max, north_min, north_max), optional
         Area of the site; forests are cut at a distance of :data:`_FOREST_MARGIN_M` around it.
+    progress : Progress
+        Receives the share of outlines that are read, for large maps.
 
     Returns
     -------
@@ -177,7 +184,7 @@ def import_footprints(
             result.credits.append(content.credit)
         with about_file(path):
             _check_place(content, frame)
-            _sort(content, Path(path).name, frame, untagged, shapes, result.actions)
+            _sort(content, Path(path).name, frame, untagged, shapes, result.actions, progress)
         result.ground += content.ground
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
@@ -205,10 +212,13 @@ def _sort(
     untagged: mapfiles.Kind | None,
     shapes: dict[mapfiles.Kind, list[_Shape]],
     actions: list[str],
+    progress: Progress,
 ) -> None:
     """Add each outline of the file ``name`` to the shapes of its kind, and count outlines of unknown kind."""
     skipped: Counter[str] = Counter()
-    for outline in content.outlines:
+    for number, outline in enumerate(content.outlines, 1):
+        if number % _OUTLINES_PER_REPORT == 0:
+            progress(f"outlines of {name}", number / len(content.outlines))
         bare = untagged if mapfiles.main_tag(outline.tags) == "untagged" else None
         kind = mapfiles.kind_of(outline.tags) or bare or ("geofence" if content.kind == "KML" else None)
         if kind is None or (kind == "building" and mapfiles.below_ground(outline.tags)):
@@ -718,10 +728,10 @@ def _around_towers(content: dict[str, Any], imports: Footprints, frame: SiteFram
     positions = [Point(*frame.to_local(tower["latitude_deg"], tower["longitude_deg"])) for tower in towers.values()]
     reach = box(-_AROUND_M, -_AROUND_M, _AROUND_M, _AROUND_M)
     shapes = [item.footprint for item in imports.buildings] + [item.area for item in imports.forests]
-    mapped = shapely.union_all([shape.intersection(reach) for shape in shapes])
+    mapped = shapely.intersection(shapes, reach)
     # a tower farther away is a typing error, which build_site reports
     around = [place.buffer(_NEAR_TOWER_M) for place in positions if place.distance(positions[0]) <= FAR_M]
-    west, south, east, north = shapely.union_all([mapped, *around]).bounds
+    west, south, east, north = shapely.total_bounds([*mapped, *around])
     area = content["area_m"] = [math.floor(west), math.ceil(east), math.floor(south), math.ceil(north)]
     known = [[round(float(value), 2) for value in (*frame.to_local(*place), height_m, _ELEVATION_SD_M)]
              for place, height_m in imports.ground if reach.contains(Point(frame.to_local(*place)))]  # fmt: skip
@@ -736,7 +746,7 @@ def _around_towers(content: dict[str, Any], imports: Footprints, frame: SiteFram
         f"the origin is tower {first}; the ground is {ground}, of {material}; the area is {area[1] - area[0]} m x "
         f"{area[3] - area[2]} m: the map within {_AROUND_M / 1000:g} km of the origin. Change them in the file"
     )
-    if mapped.area > 0.0 or not shapes:
+    if shapely.area(mapped).any() or not shapes:
         return [about]
     away_km = min(shape.distance(positions[0]) for shape in shapes) / 1000
     return [about, f"warning: no building or wood within {_AROUND_M / 1000:g} km of tower {first}; the nearest is "

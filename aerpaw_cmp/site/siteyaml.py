@@ -17,7 +17,6 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields, replace
-from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -383,19 +382,13 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
             expected=f"a site.yaml or one of {', '.join(PACKAGED)}",
             cause=f"did you mean '{near}'?" if near else None,
         )
-    return name, *_packaged(name)
+    with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / f"{name}.yaml") as file:
+        return name, *load_yaml_and_lines(file, SiteModel)
 
 
 def packaged_name(name: str) -> str:
     """Return the file name of a packaged site for names such as lake-wheeler or Lake Wheeler."""
     return name.lower().replace("-", "_").replace(" ", "_")
-
-
-@cache
-def _packaged(name: str) -> tuple[SiteModel, LineOf]:
-    """Return the settings of a packaged site, cached because a campaign requests them for each flight."""
-    with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / f"{name}.yaml") as file:
-        return load_yaml_and_lines(file, SiteModel)
 
 
 def build_site(model: SiteModel, folder: Path | None = None) -> Site:
@@ -646,9 +639,10 @@ def _check_name(name: str, others: Iterable[str]) -> None:
 
 def _unmapped(towers: Mapping[str, Tower], shapes: list[Polygon]) -> list[str]:
     """Return warnings about towers without any object of the map nearby, where the ground is unknown."""
-    place = shapely.union_all(shapes)
-    bare = [t.name for t in towers.values() if place.distance(Point(t.east_m, t.north_m)) > _MAPPED_M]
-    if not shapes or not bare:
+    # the nearest shape, because a union of all shapes of a town takes seconds
+    away = {t.name: shapely.distance(shapes, Point(t.east_m, t.north_m)) for t in towers.values()}
+    bare = [name for name, distances in away.items() if shapes and distances.min() > _MAPPED_M]
+    if not bare:
         return []
     return [f"no map here: the site has no building and no wood within {_MAPPED_M:g} m of {', '.join(bare)}"]
 
@@ -716,16 +710,15 @@ def _trees(
     notes: list[str],
 ) -> tuple[Trees, Trees]:
     """Return the trees of the site, and separately those of forest stands, which only opaque foliage uses."""
-    # do not place trees inside houses or on masts
+    single = [(at, forest) for at, forest in enumerate(forests) if forest.height_m is None or forest.trees]
+    # do not place trees inside houses or on masts; a union of all houses of a town takes seconds
     clear = shapely.union_all(
-        [building.footprint for building in buildings]
+        [building.footprint for building in buildings if single]
         + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
     )
     parts: list[Trees] = []
     of_stands: list[Trees] = []
-    for index, forest in enumerate(forests):
-        if forest.height_m is not None and not forest.trees:
-            continue
+    for index, forest in single:
         with _at("forests", index):
             placed = place_trees(forest, model, seed=model.seed, keep_clear=clear)
         wanted = wanted_trees(forest, clear)
@@ -934,20 +927,11 @@ def site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
     """Yield name, role and path of the site file and of the files that it names."""
     path = folder / name
     if not path.is_file():
-        _site_model(name, 0, 0)
+        site_model(name)
         packaged = f"{packaged_name(name)}.yaml"
         with resources.as_file(resources.files(__package__) / "data" / packaged) as file:
             yield f"aerpaw_cmp/site/data/{packaged}", "site file (packaged)", file
         return
     yield name, "site file", path
-    status = path.stat()
-    model = _site_model(path, status.st_size, status.st_mtime_ns)
-    for key, text, place in named_files(model.model_dump(), [path.parent]):
+    for key, text, place in named_files(site_model(path).model_dump(), [path.parent]):
         yield text, f"site: {key}", place
-
-
-# size and time are arguments, so that a site that is edited between two tasks is read again
-@lru_cache(maxsize=16)
-def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> SiteModel:
-    """Return a checked site file, cached because a campaign requests it with every task."""
-    return site_model(site)

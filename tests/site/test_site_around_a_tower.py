@@ -7,6 +7,7 @@ import pytest
 from shapely.geometry import Point
 
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.site import footprints
 from aerpaw_cmp.site.footprints import import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -39,6 +40,15 @@ def test_first_tower_is_the_origin_and_buildings_keep_their_place(tmp_path: Path
     west, east, south, north = site.area_m
     assert west <= mast.east_m - 500
     assert min(east, -south, north) >= 500
+
+
+def test_a_large_map_shows_its_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(footprints, "_OUTLINES_PER_REPORT", 1)
+    told: list[tuple[str, float | None]] = []
+    towers = (f"roof={LATITUDE},{LONGITUDE},25",)
+    files = [campus(tmp_path / name) for name in ("one.geojson", "two.geojson")]
+    import_site(files, towers=towers, progress=lambda text, share=None: told.append((text, share)))
+    assert told == [("outlines of one.geojson", 1.0), ("outlines of two.geojson", 1.0)]
 
 
 def test_a_tower_away_from_the_map_or_from_the_first_tower_is_named(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def site_import(
     else:
         actions = run.run_site_import(
             files, out, base=base, towers=tower or (), force=force, dem=dem, dem_crs=dem_crs, untagged=untagged,
-            trees=trees,
+            trees=trees, progress=say,
         )  # fmt: skip
     if answered({"file": str(out), "base": base, "actions": actions}):
         return

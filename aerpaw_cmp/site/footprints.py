@@ -718,7 +718,8 @@ def import_site(
     about = [] if base is not None else _around_towers(content, imports, frame)
     actions = _from_maps(content, imports)
     model = SiteModel.model_validate(content)
-    build_site(model)  # fails now if elevations or towers are elsewhere
+    site = build_site(model)  # fails now if elevations or towers are elsewhere
+    actions += [f"warning: {text}" for text in site.cautions()]
     return model, [*(about or [_kept_of_base(model, str(base))]), *actions]
 
 

@@ -42,6 +42,15 @@ def test_first_tower_is_the_origin_and_buildings_keep_their_place(tmp_path: Path
     assert min(east, -south, north) >= 500
 
 
+def test_an_antenna_inside_a_building_is_reported_by_the_import(tmp_path: Path) -> None:
+    """The first map or flight would show a tower that no path reaches."""
+    inside = [f"roof={LATITUDE + 2e-4},{LONGITUDE + 2e-4},{height}" for height in (15, 25)]
+    low, high = (import_site([campus(tmp_path / "campus.geojson")], towers=[tower])[1] for tower in inside)
+    about = "warning: the antenna of tower roof (15.0 m up) is inside building 'hall' (roof at 20.0 m)"
+    assert [text.startswith(about) for text in low].count(True) == 1
+    assert not any("inside building" in text for text in high)
+
+
 def test_a_large_map_shows_its_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(footprints, "_OUTLINES_PER_REPORT", 1)
     told: list[tuple[str, float | None]] = []

@@ -25,9 +25,9 @@ def show(text: object, *, to_stderr: bool = False) -> None:
 class ProgressLines:
     """Progress on standard error, so that standard output contains only results.
 
-    On a terminal, progress is a bar with the remaining time. Elsewhere, a line is printed at each quarter. Text after a
-    tab may change between calls. The bar shows this text; elsewhere it is printed every half minute. If ``quiet`` is
-    set, only :meth:`warn` prints. If ``as_json`` is set, standard output contains one JSON object.
+    On a terminal, progress is a bar with the remaining time. Elsewhere, a line is printed at each quarter and every
+    half minute. Text after a tab may change between calls. If ``quiet`` is set, only :meth:`warn` prints. If
+    ``as_json`` is set, standard output contains one JSON object.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class ProgressLines:
             self._draw(text, fraction)
         else:
             name, _, tail = text.partition("\t")
-            late = tail and time.monotonic() - self._last >= _EVERY_S
+            late = time.monotonic() - self._last >= _EVERY_S
             if late or int(4 * fraction) > self._quarters.get(name, 0):
                 self._quarters[name], self._last = int(4 * fraction), time.monotonic()
                 show(f"{name} {100 * fraction:.0f} %{tail and ': ' + tail}", to_stderr=True)

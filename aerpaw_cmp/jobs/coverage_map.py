@@ -42,6 +42,7 @@ from ..report import maps as page
 from ..report.prediction import outside_share
 from ..site.site import Site
 from ..site.siteyaml import coverage_of, inputs_of_site, load_site
+from .options import HIGHEST_M
 from .predict import CorrectedMaps
 from .tasks import code_digest
 from .workers import InProcess, Lost, Workers
@@ -122,8 +123,8 @@ class MapSettings:
         if unknown or not self.foliage:
             raise UsageError(f"foliage {', '.join(unknown) or '(none given)'!r}", expected=", ".join(FOLIAGE))
         heights = (*self.rss_altitudes_m, *self.rank_altitudes_m)
-        if not heights or any(not h > 0 for h in heights):
-            raise UsageError(f"heights {heights}", expected="heights above ground [m], above 0")
+        if not heights or any(not 0 < h <= HIGHEST_M for h in heights):
+            raise UsageError(f"heights {heights}", expected=f"heights above ground [m], above 0, up to {HIGHEST_M:g}")
         if not self.ks or any(not k > 1 for k in self.ks):
             raise UsageError(f"K {self.ks}", expected="ratios of singular values, above 1")
         if fault := units.carrier_fault(self.carrier_hz):
@@ -201,7 +202,8 @@ class SiteChannels:
         power_dbm = settings.budget.tx_power_dbm + float(units.db_from_power(settings.elements))
         reach_m = range_m(settings.carrier_hz, power_dbm, units.THERMAL_NOISE_DBM_HZ)
         self.reach = Reach(site, reach_m, max_depth=settings.max_depth)
-        self.paths = 0
+        self.paths = self._done = self._all = 0
+        self._progress: Callable[[float], object] | None = None
         self._ready: dict[tuple[str, bytes], grids.Evaluation] = {}
         self._take_site(site)
 
@@ -242,10 +244,11 @@ class SiteChannels:
     def _maps(self, grid: Grid, progress: Callable[[float], object] | None = None) -> dict[str, MapResult]:
         s = self.settings
         towers = {name: tower.position_m for name, tower in self.reach.site.towers.items()}
+        self._progress, self._done, self._all = progress, 0, len(grid) * len({*s.rss_altitudes_m, *s.rank_altitudes_m})
         return {
             mode: grids.map_job(
                 grid, towers, self.of(mode), rss_altitudes_m=s.rss_altitudes_m, rank_altitudes_m=s.rank_altitudes_m,
-                ks=s.ks, progress=progress if mode == s.foliage[0] else None,
+                ks=s.ks,
             )
             for mode in s.foliage
         }  # fmt: skip
@@ -262,8 +265,8 @@ class SiteChannels:
             nothing = grids.Evaluation(none, none, none, np.empty((n, 0, s.elements)))
             return dict.fromkeys(s.foliage, self._for_all_towers(nothing))
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
-        search = Search(max_depth=s.max_depth)
-        replayed = replay(self.site, self.siso, poses, search, run=Run(extent_m=self.reach.extent_m))
+        search, run = Search(max_depth=s.max_depth), Run(extent_m=self.reach.extent_m, progress=self._progress_of(n))
+        replayed = replay(self.site, self.siso, poses, search, run=run)
         self.paths += len(replayed.paths)
         siso, mimo = replayed.h, channel_matrices(replayed.paths, replayed.faces, self.sources_m, poses, self.mimo).h
         result = {}
@@ -277,6 +280,12 @@ class SiteChannels:
             sigma = np.where(covered[..., None], singular_values(shaded_mimo), 0.0)
             result[mode] = self._for_all_towers(grids.Evaluation(self._rss_dbm(shaded_siso), level, spread, sigma))
         return result
+
+    def _progress_of(self, count: int) -> Callable[[float], object] | None:
+        """Return the progress of a path search for the next ``count`` positions, as a part of the map's progress."""
+        before, self._done = self._done, self._done + count
+        progress, every = self._progress, self._all
+        return None if progress is None else lambda share: progress((before + share * count) / every)
 
     def _for_all_towers(self, some: grids.Evaluation) -> grids.Evaluation:
         """Return the evaluation of all towers. Towers that do not reach a tile are out of coverage."""

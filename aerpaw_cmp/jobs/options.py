@@ -12,6 +12,9 @@ from ..common.stages import Plan, Progress, Stages, logged
 # A sample is scored by the nearest predicted position of another program within this distance [m].
 AGAINST_DISTANCE_M = 5.0
 
+# Largest height of positions of maps and predictions [m]. Drones fly lower; a larger number is a typing error.
+HIGHEST_M = 10_000.0
+
 # Columns with the predicted probability of each rank.
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 

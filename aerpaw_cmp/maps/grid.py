@@ -408,7 +408,6 @@ def map_job(
     rank_altitudes_m: Sequence[float] = PAPER_RANK_ALTITUDES_M,
     ks: Sequence[float] = PAPER_KS,
     chunk: int = CHUNK,
-    progress: Callable[[float], object] | None = None,
 ) -> MapResult:
     """Evaluate the grid at all altitudes.
 
@@ -426,8 +425,6 @@ def map_job(
         Singular-value ratios.
     chunk : int
         Positions per call of ``evaluate``.
-    progress : callable, optional
-        Called with the share done after each chunk.
 
     Returns
     -------
@@ -443,8 +440,7 @@ def map_job(
     # 0 is out of coverage, the value of positions that the engine does not cover
     rank = np.zeros((len(at["rank"]), len(ks), t, n), dtype=np.int8)
     ratio = np.full((2, len(at["rank"]), t, n), np.nan)
-    heights = sorted({*at["rss"], *at["rank"]})
-    for step, height in enumerate(heights):
+    for height in sorted({*at["rss"], *at["rank"]}):
         # one height at a time, so that the memory does not depend on the number of heights
         positions = grid.positions_m(height)
         for start in range(0, n, chunk):
@@ -460,8 +456,6 @@ def map_job(
                     rank_of_singular_values(evaluated.singular_values, ks), (0, 1, 2), (2, 1, 0)
                 )
                 ratio[:, row, :, part] = np.moveaxis(_ratios_db(evaluated.singular_values), (1, 2), (2, 1))
-            if progress is not None:
-                progress((step * n + part.stop) / (len(heights) * n))
     return MapResult(
         grid=grid,
         tower_names=names,

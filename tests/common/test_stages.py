@@ -46,6 +46,18 @@ def test_a_share_is_a_line_per_quarter_where_there_is_no_terminal(capsys: pytest
     assert out.err.splitlines() == [f"sionna LW1 {q} %" for q in (25, 50, 75, 100)] + ["50 %"]
 
 
+def test_a_slow_share_is_a_line_every_half_minute(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = iter(range(0, 10_000, 11))
+    monkeypatch.setattr(shown.time, "monotonic", lambda: next(now))
+    progress = shown.ProgressLines()
+    for i in range(1, 9):
+        progress("maps", i / 100)
+    # each call, and each printed line, takes 11 s
+    assert capsys.readouterr().err.splitlines() == ["maps 3 %", "maps 6 %"]
+
+
 def test_a_terminal_gets_one_bar_with_the_time_left(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -122,6 +122,14 @@ def test_modes_share_one_search_and_nothing_is_kept(site):
     assert not channels._ready
 
 
+def test_the_path_search_of_each_chunk_moves_the_progress(site) -> None:
+    told: list[float] = []
+    channels = coverage_map.SiteChannels(site, settings(foliage=("none", "opaque")))
+    channels.tile(coverage_map.TileOrder(site="field", settings=channels.settings, cells=1000, number=0), told.append)
+    # three heights in one chunk each; the search reports each of the two towers
+    assert told == pytest.approx([share / 6 for share in range(1, 7)])
+
+
 def test_heights_are_above_the_ground_of_the_elevation_model():
     frame = SiteFrame(35.7, -78.7)
     east = np.arange(-1000.0, 1001.0, 10.0)
@@ -144,6 +152,7 @@ def test_heights_are_above_the_ground_of_the_elevation_model():
         ({"foliage": ("leafy",)}, "leafy"),
         ({"foliage": ()}, "none given"),
         ({"rank_altitudes_m": (0.0,)}, "above 0"),
+        ({"rss_altitudes_m": (1e7,)}, "up to 10000"),
         ({"ks": (1.0,)}, "K"),
         ({"carrier_hz": 0.0}, "carrier"),
     ],

@@ -9,13 +9,13 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from ...common.text import counted
-from ...jobs.options import RunOptions
+from ...jobs.options import HIGHEST_M, RunOptions
 from ..app import Flights, command, of_run
-from ..shown import answered, print_files, records, show, warn_all
+from ..shown import answered, print_files, records, say, show, warn_all
 
 _HEIGHT = Option(
     min=0.1,
-    max=10_000.0,
+    max=HIGHEST_M,
     help="Height [m] of a grid, of the tool's own routes, and of route points without a height; repeatable  "
     "[default: 40]",
 )

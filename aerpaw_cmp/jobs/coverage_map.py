@@ -624,7 +624,7 @@ def maps_record(
         errors=tuple(_errors(outcome)),
         paper=tuple(paper),
         warnings=() if flown is None else tuple(flown.prediction.warnings),
-        notes=_notes(outcome),
+        notes=(*_notes(outcome), *(() if flown is None else flown.prediction.notes)),
         settings=asdict(s),
         stages_s=dict(stages_s),
         metrics=_metrics(outcome),

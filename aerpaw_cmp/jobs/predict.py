@@ -204,7 +204,8 @@ def _model_fields(
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return fields | {
             "verdict": pages.first_words(None, guess, *expected),
-            "warnings": pages.memory_cautions([(m.entry, m.series) for m in model.known.values()], guess),
+            "warnings": [pages.OUTSIDE["remembered"].format(percent=100.0 * guess)] if guess > pages.MANY else [],
+            "notes": pages.memory_notes([(m.entry, m.series) for m in model.known.values()]),
             "flights": [name for entry in entries for name in entry.flights],
             KEY: union(*(entry.trained_on for entry in entries), *logs),
             MARKS: union(*(end.marks for m in model.known.values() for end in (m.tower, m.uav)), *marks),
@@ -214,6 +215,7 @@ def _model_fields(
     return fields | {
         "verdict": pages.first_words(correction, guess, *expected),
         "warnings": pages.cautions(correction, guess),
+        "notes": pages.notes(correction),
         KEY: union(*map(flight_logs, known), *logs, *model.trained_on),
         MARKS: union(marks_of(known), *marks, *model.marks),
         "candidates": [

@@ -152,23 +152,29 @@ def first_words(
             near, far = sorted(map(abs, verdict.interval))
             over = "flights" if len(correction.flights) > 1 else "blocks of the flight"
             texts.append(said_of(verdict, AGAINST_FREE_SPACE, over=over, near=near, far=far))
-        step = _stated(correction).partition("Next: ")[2]
+        step = _stated(correction)[0].partition("Next: ")[2]
     texts.append(PLAN if outside > MANY else f"Next: {step}" if step else "")
     return " ".join(text for text in texts if text)
 
 
 def cautions(correction: Correction, outside: float) -> list[str]:
-    """Return warnings about the flown area, intervals on held-out data, model and residual field."""
+    """Return warnings about the flown area, and about standard deviations that held-out data contradict."""
     texts = filled([OUTSIDE["flown"]], percent=100.0 * outside) if outside > MANY else []
-    texts += [_stated(correction).partition(" Next: ")[0], f"Model: {TITLES[correction.base]}."]
-    return [text for text in (*texts, said_of(field(correction), FIELD)) if text]
+    stated, holds = _stated(correction)
+    return texts if holds else [*texts, stated.partition(" Next: ")[0]]
 
 
-def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float) -> list[str]:
-    """Return warnings for a prediction from learned models of the site, without flights."""
+def notes(correction: Correction) -> list[str]:
+    """Return sentences about intervals on held-out data that hold, about the model, and about the residual field."""
+    stated, holds = _stated(correction)
+    texts = [stated if holds else "", f"Model: {TITLES[correction.base]}.", said_of(field(correction), FIELD)]
+    return [text for text in texts if text]
+
+
+def memory_notes(known: Sequence[tuple[Entry, LearnedSeries]]) -> list[str]:
+    """Return sentences about the learned models of the site that a prediction without flights uses."""
     each = lists_by_key((entry.about(), f"{series.tower} {series.channel}") for entry, series in known)
-    texts = filled([OUTSIDE["remembered"]], percent=100.0 * outside) if outside > MANY else []
-    return [*texts, *(f"{', '.join(names)}: {about}." for about, names in each.items())]
+    return [f"{', '.join(names)}: {about}." for about, names in each.items()]
 
 
 def prior_words(carrier_hz: float, power_dbm: float) -> str:
@@ -190,13 +196,14 @@ def prior_cautions(sd_db: Mapping[str, float], beyond: float) -> list[str]:
     return texts
 
 
-def _stated(correction: Correction) -> str:
-    """Return the sentence and next step about the stated standard deviations on held-out data."""
+def _stated(correction: Correction) -> tuple[str, bool]:
+    """Return sentence and next step about the stated standard deviations on held-out data, and whether they hold."""
     error, sd = correction.held_out[correction.base, correction.title]
     verdict = stated_errors(error, sd, place_m=correction.held_out_place_m)
     known = np.isfinite(error)
     inside = np.abs(error[known]) <= 1.6449 * sd[known]  # 1.6449 SD is half of a 90 % interval
-    return said_of(verdict, STATED, inside=100.0 * float(inside.mean()) if known.any() else float("nan"))
+    share = 100.0 * float(inside.mean()) if known.any() else float("nan")
+    return said_of(verdict, STATED, inside=share), verdict.cause == "none"
 
 
 def _against_free_space(correction: Correction) -> Verdict:
@@ -250,6 +257,7 @@ class PredictionPage(Made):
     trained_on: Sequence[str]
     marks: Sequence[str]
     warnings: Sequence[str]
+    notes: Sequence[str] = ()
 
     @property
     def levels(self) -> pd.DataFrame:
@@ -288,7 +296,7 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
     return json_object(
         prediction=data.name,
         kind=data.kind, flights=data.flights, trained_on=data.trained_on, marks=data.marks, chosen=data.chosen,
-        candidates=data.candidates, warnings=data.warnings,
+        candidates=data.candidates, warnings=data.warnings, notes=data.notes,
         sentence=data.verdict,
         field=data.model,
         series=series,
@@ -305,7 +313,7 @@ def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Map
     about = f"Learned from {', '.join(data.flights)}. " if data.flights else ""
     about += f"Made {minute(data.generated)}. prediction.csv in the same folder contains every point."
     return Page(
-        kind="prediction", title=data.name, verdict=data.verdict, cautions=data.warnings, about=[about],
+        kind="prediction", title=data.name, verdict=data.verdict, cautions=data.warnings, about=[*data.notes, about],
         cards=[Card(title="Map", positions=Positions(view="places", data=shown)),
                _levels_card(numbers, lock="p_lock" in data.table, flown=bool(data.flights)),
                _model_card(data)],

@@ -81,6 +81,8 @@ def _print_prediction(outcome: Any) -> None:
         **({"outside flown area": "share_outside_flown:.0%"} if m["flights"] else {}), "points": "points",
     }  # fmt: skip
     records(series, columns, "Prediction")
+    for note in m["notes"]:
+        say(note)
     warn_all(m["warnings"])
     show(f"page: {outcome.folder / 'prediction.html'}")
 

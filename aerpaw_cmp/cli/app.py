@@ -44,7 +44,7 @@ app.add_typer(antenna_app, name="antenna", help=COMMANDS["antenna"])
 
 Json = Annotated[bool, Option("--json", help="Print only one JSON object on standard output.")]
 Force = Annotated[
-    bool, Option("--force", help="Also replace files that this tool did not write; inputs are never replaced.")
+    bool, Option("--force", help="Also replace edited results, and an output file even if another program wrote it.")
 ]
 LogsRoot = Annotated[Path | None, Option("--logs-root", help="Folder to which the paths of the logs are relative.")]
 Flights = Annotated[

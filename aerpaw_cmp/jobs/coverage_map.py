@@ -40,6 +40,7 @@ from ..propagation.options import Run, Search
 from ..propagation.replay import Replay, replay
 from ..report import maps as page
 from ..report.prediction import outside_share
+from ..site.materials import material
 from ..site.site import Site
 from ..site.siteyaml import coverage_of, inputs_of_site, load_site
 from .options import HIGHEST_M
@@ -525,7 +526,11 @@ def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[
 
 
 def check_study(place: Site, settings: MapSettings) -> None:
-    """Refuse a study of fewer than two rank heights before any map is computed."""
+    """Refuse a study of fewer than two rank heights, or unknown materials, before any map is computed."""
+    for name in sorted(
+        {place.ground_material, *(item.material for item in place.buildings)} if settings.max_depth else ()
+    ):
+        material(name).relative_permittivity(settings.carrier_hz)
     studied = settings.study and not settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m))
     heights = [height for height in settings.rank_altitudes_m if height >= interpolation.LOWEST_M]
     if studied and len(heights) < 2:

@@ -251,7 +251,8 @@ def _radio_map(content: bytes, path: Path) -> Read:
     needed = ("path_gain", "cell_centers", "tx_names")
     with parsing(path, f"an .npz with {', '.join(needed)}"), np.load(io.BytesIO(content)) as book:
         if missing := set(needed) - set(book.files):
-            raise InputError(f"no array {', '.join(sorted(missing))}", expected=", ".join(needed))
+            cause = "an Excel workbook; save the sheet as CSV" if "xl/workbook.xml" in book.files else None
+            raise InputError(f"no array {', '.join(sorted(missing))}", expected=", ".join(needed), cause=cause)
         if sum(info.file_size for info in book.zip.infolist()) > _MOST_BYTES:
             raise InputError("the arrays are too large", expected=f"at most {_MOST_BYTES >> 20} MiB")
         gain, centre, names = (np.asarray(book[name]) for name in needed)
@@ -403,7 +404,7 @@ def _check_numbers(table: pd.DataFrame, quantity: str) -> None:
         (not table["rank"].dropna().isin(range(MAX_RANK + 1)).all(), "ranks that are not 0 to 4",
          "1 to 4, or 0 without a channel", None),
         ((shares < 0.0).any(axis=None) or (abs(shares.sum(axis=1) - 1.0) > 0.01).any(),
-         "p_rank1 to p_rank4 below 0, or with another sum than 1", "probabilities", None),
+         "p_rank1 to p_rank4 below 0, or with another sum than 1", "probabilities", "percent, or counts of samples"),
     ):  # fmt: skip
         if wrong:
             raise InputError(found, expected=expected, cause=cause)
@@ -423,7 +424,7 @@ def _check_repeats(table: pd.DataFrame) -> None:
         raise InputError(
             f"{counted(len(twice), 'row')} with several levels at one {'time' if 'time' in key else 'position'}: {at}",
             expected="one row per tower, channel and time or position",
-            cause="two channels or two heights, but no column for the channel or the height",
+            cause="channels, heights or headings without a column that distinguishes them, or random fading",
         )
 
 

@@ -200,7 +200,8 @@ def import_footprints(
         raise InputError(
             "no building, forest, geofence or tree found in " + ", ".join(Path(f).name for f in files),
             expected="areas tagged building, natural=wood or landuse=forest, or '--untagged building'",
-            cause="; ".join(text.removeprefix(alone) for text in result.actions[-3:]) or "the map is empty",
+            cause="; ".join(text.removeprefix("warning: ").removeprefix(alone) for text in result.actions[-3:])
+            or "the map is empty",
         )
     return result
 

@@ -202,12 +202,15 @@ def below_ground(tags: Mapping[str, str]) -> bool:
     True
     >>> below_ground({"building": "yes", "building:levels": "0", "building:levels:underground": "3"})
     True
+    >>> below_ground({"type": "building", "is_underground": "True"})  # Overture
+    True
     """
     if "underground" in (tags.get("location", "").lower(), tags.get("parking", "").lower()):
         return True
     # objects with a negative layer are below others
     layer = _number(tags.get("layer", ""))
-    if tags.get("tunnel", "no").lower() not in _NOT or (layer is not None and layer < 0):
+    tunnel = any(tags.get(key, "no").lower() not in _NOT for key in ("tunnel", "is_underground"))
+    if tunnel or (layer is not None and layer < 0):
         return True
     levels, cellars = (_number(tags.get(f"building:levels{what}", "")) for what in ("", ":underground"))
     return levels is not None and levels <= 0 and bool(cellars) and not tags.get("height")
@@ -643,6 +646,8 @@ def _from_json(data: bytes, path: Path) -> MapFile:
     except json.JSONDecodeError as error:
         # an error at the end means that the text is truncated
         cause = "the file was cut off" if error.pos >= len(text.rstrip()) - 1 else None
+        if error.msg == "Extra data":
+            cause = "one feature per line; 'ogr2ogr -f GeoJSON map.geojson FILE' makes GeoJSON of it"
         raise InputError(f"not JSON: {error.msg}", cause=cause, line=error.lineno) from None
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
@@ -651,7 +656,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         result = read_elements("Overpass JSON", content["elements"], path)
         # Overpass answers with status 200 and a remark if it ran out of time
         if remark := content.get("remark"):
-            result.notes.append(f"warning: {path.name}: the Overpass server reports:  {str(remark)[:200]}")
+            result.notes.append(f"warning: {path.name}: the Overpass server reports: {str(remark)[:200]}")
         return result
     if isinstance(content, dict) and "type" in content:
         return _geojson(content, path)

@@ -86,7 +86,7 @@ def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
     np.testing.assert_allclose(levels["sd_db"], np.hypot(slow, 3.0), atol=0.01)
     assert said.page.trained_on == ("a" * 64,)
     assert said.page.marks == (MARK,)  # report --against knows a copy of the training log by them
-    assert any("expect an RMSE of 3.7 dB on another flight, free space 6.1 dB" in text for text in said.page.warnings)
+    assert any("expect an RMSE of 3.7 dB on another flight, free space 6.1 dB" in text for text in said.page.notes)
     assert said.page.verdict.startswith(f"Expect an RMSE of {np.sqrt(np.mean(said.table['slow_sd_db'] ** 2)):.1f} dB")
     assert said.page.units == {"LW1 A": "dBm"}
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -217,6 +218,7 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
         (lambda f: f.assign(time_utc=f["time_utc"].str.replace("T14", "T18")), "another time zone, +4 h"),
         (lambda f: f.rename(columns={"time_utc": "time"}).assign(time="2025-06-01 14:00:00"), "times without a zone"),
         (lambda f: pd.concat([f, f.assign(level_dbm=-50.0)]), "with several levels at one time"),
+        (lambda f: f.assign(p_rank1=40.0, p_rank2=60.0), "Likely cause: percent, or counts of samples"),
         (lambda f: f.drop(columns="tower"), "no column tower"),
         (lambda f: f.drop(columns="time_utc"), "without a time and without a position"),
         (
@@ -269,6 +271,9 @@ def test_damaged_files_are_one_message(flight: Path, capsys: pytest.CaptureFixtu
     centre = np.zeros((2, 2, 3))
     np.savez(flight / "db.npz", path_gain=np.full((1, 2, 2), -90.0), cell_centers=centre, tx_names=np.array(["LW1"]))
     assert "a path_gain below 0; expected a linear gain, 0 or more" in refused(flight, flight / "db.npz", capsys)
+    with zipfile.ZipFile(flight / "sheet.xlsx", "w") as book:
+        book.writestr("xl/workbook.xml", "<workbook/>")
+    assert "an Excel workbook; save the sheet as CSV" in refused(flight, flight / "sheet.xlsx", capsys)
     xarray.Dataset({"rss": ("time", np.zeros(3)), "tower": "LW1"}).to_netcdf(flight / "rss.nc")
     assert "(columns: time, rss, tower)" in refused(flight, flight / "rss.nc", capsys)
 

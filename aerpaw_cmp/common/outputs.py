@@ -369,6 +369,9 @@ class OutputFolder:
         """Raise UsageError if the folder contains files that this tool did not write or that were changed later."""
         if not self.target.is_dir():
             return
+        # its files could not be removed after the computation
+        if not os.access(self.target, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self.target))
         own = read_sums(self.target)
         list_of_others = SUMS if own is None and _taken(self.target / SUMS) else None
         own = own or {}
@@ -606,6 +609,10 @@ def _clear(part: Path, *, keep: bool = False) -> None:
     # os.walk enters mounts, and unlink would empty the mounted disk
     if _mounted_below(part):
         raise OSError(errno.EXDEV, "a file system is mounted there", str(part))
+    # the rights of replaced results may not allow removing their files
+    for folder in (part, *(Path(parent, name) for parent, names, _ in os.walk(part) for name in names)):
+        if not folder.is_symlink():
+            folder.chmod(stat.S_IMODE(folder.stat().st_mode) | stat.S_IRWXU)
     signs = [part / _UNFINISHED, part / SUMS]
     names = files_below(part) if signs[0].exists() else [part / name for name in read_sums(part) or ()]
     for file in names:

@@ -6,7 +6,8 @@ import os
 import shutil
 import stat
 import subprocess
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -200,6 +201,46 @@ def test_rights_that_were_taken_away_stay_so(tmp_path: Path) -> None:
     target.chmod(0o750)
     write_folder(target, {"a.html": "2", "figures/a.svg": "2"})
     assert [stat.S_IMODE(path.stat().st_mode) for path in (target, target / "figures")] == [0o750, 0o700]
+
+
+@pytest.fixture
+def shared() -> Iterator[Path]:
+    """A folder of an ordinary user, who obeys rights: root may write everywhere."""
+    root = os.geteuid() == 0
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o777)
+        if root:
+            os.setresuid(65534, 65534, 0)
+        try:
+            yield Path(name)
+        finally:
+            if root:
+                os.setresuid(0, 0, 0)
+
+
+def test_read_only_results_are_refused_at_once_and_leave_nothing(shared: Path) -> None:
+    target = shared / "report"
+    write_folder(target, {"a.html": "1"})
+    target.chmod(0o555)
+    with (
+        pytest.raises(OutputError, match="Permission denied"),
+        OutputFolder(target, job="test"),
+    ):
+        pytest.fail("the computation began")
+    assert list(shared.iterdir()) == [target]
+    target.chmod(0o755)
+    write_folder(target, {"a.html": "2"})
+    assert content(target)["a.html"] == b"2"
+
+
+def test_read_only_folders_in_results_are_replaced_and_leave_nothing(shared: Path) -> None:
+    target = shared / "report"
+    write_folder(target, {"a.html": "1", "figures/a.svg": "1"})
+    for text in ("2", "3"):
+        (target / "figures").chmod(0o555)
+        write_folder(target, {"a.html": text, "figures/a.svg": text})
+        assert content(target)["figures/a.svg"] == text.encode()
+        assert list(shared.iterdir()) == [target]
 
 
 def mount(*words: object) -> bool:

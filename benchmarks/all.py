@@ -68,7 +68,6 @@ SMALLEST: dict[str, list[str]] = {
     "peers": ["--quick"],
     "performance": ["--docs", "{folder}/performance.md"],
     "planted_causes": ["--flights", "16"],
-    "planted_fields": ["--sets", "1", "--targets", "200"],
     "published": ["tasks", "--data", "sample_logs"],
     "real_ground": ["--only", "aadm", "--no-fit"],
     "predicted_triples": ["--triples", "1"],

@@ -156,7 +156,6 @@ def test_slope_of_the_likelihood_by_differences():
 
 
 def test_planted_fields_are_recovered_with_intervals_that_hold():
-    """Run a few simulated flights. ``benchmarks/planted_fields.py`` runs 200."""
     generator = np.random.default_rng(8)
     inside, errors, plain, strengths = [], [], [], []
     for _ in range(6):

@@ -431,3 +431,9 @@ def test_a_ring_of_a_million_crossings_is_left_out_and_said(tmp_path: Path) -> N
     footprints = read(tmp_path, collection(feature(polygon(ring), building="yes"), good))
     assert len(footprints.buildings) == 1
     assert said(footprints, "crosses itself at more than 1000 places is skipped")
+
+
+@pytest.mark.parametrize("point", [("nan", 35.7), (-78.7, "nan"), ("inf", 35.7)])
+def test_a_coordinate_that_is_not_a_number_is_refused(point):
+    with pytest.raises(InputError, match="a coordinate is not a number"):
+        mapfiles.lonlat(point, "building 1")

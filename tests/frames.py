@@ -1,7 +1,9 @@
-"""Comparison of data frames. The slow assertion of pandas runs only if the frames differ."""
+"""Comparison of data frames, and shorter records. The slow assertion of pandas runs only if the frames differ."""
 
+import dataclasses
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.logs.records import ReadResult
@@ -22,3 +24,20 @@ def assert_same_result(left: ReadResult, right: ReadResult) -> None:
     ]
     for a, b in zip(left.streams, right.streams, strict=True):
         assert_same_frame(a.frame, b.frame)
+
+
+def thinned(record: Any, every: int, **change: Any) -> Any:
+    """Return every n-th sample of a record."""
+    n = len(record.time)
+    cut: dict[str, Any] = {
+        f.name: value[::every]
+        for f in dataclasses.fields(record)
+        if isinstance(value := getattr(record, f.name), np.ndarray) and len(value) == n
+    }
+    if hasattr(record, "baselines"):
+        cut["baselines"] = {
+            name: dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for name, b in record.baselines.items()
+        }
+    if hasattr(record, "rank"):
+        cut["rank"] = {k: rank[::every] for k, rank in record.rank.items()}
+    return dataclasses.replace(record, **cut, **change)

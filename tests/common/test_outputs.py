@@ -222,10 +222,7 @@ def test_read_only_results_are_refused_at_once_and_leave_nothing(shared: Path) -
     target = shared / "report"
     write_folder(target, {"a.html": "1"})
     target.chmod(0o555)
-    with (
-        pytest.raises(OutputError, match="Permission denied"),
-        OutputFolder(target, job="test"),
-    ):
+    with pytest.raises(OutputError, match="Permission denied"), OutputFolder(target, job="test"):
         pytest.fail("the computation began")
     assert list(shared.iterdir()) == [target]
     target.chmod(0o755)

@@ -13,25 +13,9 @@ from aerpaw_cmp.compare.gains import NO_SPREAD, StatedSpread
 from aerpaw_cmp.maps.export import Scale
 from aerpaw_cmp.report import columns as export
 from aerpaw_cmp.report import kmz
+from tests.frames import thinned
 
 ODD = 'LW<4> & "ö"'
-
-
-def thinned(record, every, **change):
-    """Return every n-th sample of a record."""
-    n = len(record.time)
-    cut = {
-        f.name: value[::every]
-        for f in dataclasses.fields(record)
-        if isinstance(value := getattr(record, f.name), np.ndarray) and len(value) == n
-    }
-    if hasattr(record, "baselines"):
-        cut["baselines"] = {
-            name: dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for name, b in record.baselines.items()
-        }
-    if hasattr(record, "rank"):
-        cut["rank"] = {k: rank[::every] for k, rank in record.rank.items()}
-    return dataclasses.replace(record, **cut, **change)
 
 
 @pytest.fixture(scope="module")

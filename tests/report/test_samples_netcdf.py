@@ -12,35 +12,18 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.run import ReportOptions, run_report
 from aerpaw_cmp.report.columns import RANK, RSS, csv_text
 from aerpaw_cmp.report.samples_netcdf import write_netcdf
+from tests.frames import thinned
 
 xarray = pytest.importorskip("xarray")
-
-
-def every(record, step, **change):
-    """Return every n-th sample of a record."""
-    n = len(record.time)
-    cut = {
-        field.name: value[::step]
-        for field in dataclasses.fields(record)
-        if isinstance(value := getattr(record, field.name), np.ndarray) and len(value) == n
-    }
-    if hasattr(record, "baselines"):
-        cut["baselines"] = {
-            name: dataclasses.replace(model, level_dbm=model.level_dbm[::step])
-            for name, model in record.baselines.items()
-        }
-    if hasattr(record, "rank"):
-        cut["rank"] = {k: rank[::step] for k, rank in record.rank.items()}
-    return dataclasses.replace(record, **cut, **change)
 
 
 @pytest.fixture(scope="module")
 def data(report_data):
     """Two series of different length with an unknown position, a name in Latin-1, and a rank without CSI."""
-    first, last = every(report_data.rss[0], 60), every(report_data.rss[2], 70, tower='LW<4> "ö"')
+    first, last = thinned(report_data.rss[0], 60), thinned(report_data.rss[2], 70, tower='LW<4> "ö"')
     place = np.array(first.position_m)
     place[7] = np.nan
-    rank = dataclasses.replace(every(report_data.rank[0], 10), level_dbm=np.linspace(-90, -50, 100))
+    rank = dataclasses.replace(thinned(report_data.rank[0], 10), level_dbm=np.linspace(-90, -50, 100))
     return dataclasses.replace(
         report_data, rss=(dataclasses.replace(first, position_m=place), last), rank=(rank,), synthetic=True
     )

@@ -28,16 +28,13 @@ def assert_same_result(left: ReadResult, right: ReadResult) -> None:
 
 def thinned(record: Any, every: int, **change: Any) -> Any:
     """Return every n-th sample of a record."""
-    n = len(record.time)
     cut: dict[str, Any] = {
         f.name: value[::every]
         for f in dataclasses.fields(record)
-        if isinstance(value := getattr(record, f.name), np.ndarray) and len(value) == n
+        if isinstance(value := getattr(record, f.name), np.ndarray) and len(value) == len(record.time)
     }
-    if hasattr(record, "baselines"):
-        cut["baselines"] = {
-            name: dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for name, b in record.baselines.items()
-        }
+    if baselines := getattr(record, "baselines", {}):
+        cut["baselines"] = {n: dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for n, b in baselines.items()}
     if hasattr(record, "rank"):
         cut["rank"] = {k: rank[::every] for k, rank in record.rank.items()}
     return dataclasses.replace(record, **cut, **change)

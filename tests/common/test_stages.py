@@ -2,6 +2,7 @@
 
 import sys
 import time
+from typing import Any
 
 import pytest
 
@@ -46,9 +47,7 @@ def test_a_share_is_a_line_per_quarter_where_there_is_no_terminal(capsys: pytest
     assert out.err.splitlines() == [f"sionna LW1 {q} %" for q in (25, 50, 75, 100)] + ["50 %"]
 
 
-def test_a_slow_share_is_a_line_every_half_minute(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_share_is_a_line_every_half_minute(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter(range(0, 10_000, 11))
     monkeypatch.setattr(shown.time, "monotonic", lambda: next(now))
     progress = shown.ProgressLines()

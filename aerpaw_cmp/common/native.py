@@ -229,10 +229,15 @@ def _data_sets(group: Any, depth: int, kinds: str, path: str = "", seen: set[Any
         if isinstance(item, h5py.Group) and depth > 1:
             found |= _data_sets(item, depth - 1, kinds, f"{place}/", seen)
         elif isinstance(item, h5py.Dataset):
-            if item.is_virtual or item.external:
-                raise _lies_elsewhere(f"the data of {place!r} are in other files")
+            _refuse_elsewhere(place, item)
             found |= {place: item} if item.dtype.kind in kinds else {}
     return found
+
+
+def _refuse_elsewhere(place: str, item: Any) -> None:
+    # a function, so that a test can switch it off and show that the kernel refuses as well
+    if item.is_virtual or item.external:
+        raise _lies_elsewhere(f"the data of {place!r} are in other files")
 
 
 def _lies_elsewhere(reason: str) -> InputError:

@@ -52,7 +52,7 @@ def test_nan_on_both_sides_and_infinities_do_not_count():
 
 
 def test_sides_of_different_length_are_refused():
-    with pytest.raises(ValueError, match="must be pairs"):
+    with pytest.raises(ValueError, match="expected the same"):
         grid_offset([1.0, 2.0], [1.0])
     with pytest.raises(ValueError, match="step"):
         grid_offset([1.0], [1.0], step_db=0.0)

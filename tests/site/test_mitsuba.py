@@ -47,7 +47,7 @@ def test_a_ply_cut_off_anywhere_is_one_message():
         (b"vertex_index", b"vertex_names", "its faces list no vertices"),
         (b"uint vertex_index", b"float vertex_index", "its faces list no vertices"),
         (b"element vertex 4", b"element vertex -4", "ends before"),
-        (b"property float s", b"property half s", "the header says 'property half s'"),
+        (b"property float s", b"property half s", "the header has 'property half s'"),
         (b"\x03", b"\x04", "a face is not a triangle"),
     ],
 )

@@ -611,7 +611,8 @@ def _clear(part: Path, *, keep: bool = False) -> None:
         raise OSError(errno.EXDEV, "a file system is mounted there", str(part))
     # the rights of replaced results may not allow removing their files
     for folder in (part, *(Path(parent, name) for parent, names, _ in os.walk(part) for name in names)):
-        if not folder.is_symlink():
+        # only the owner can change the rights, but a group may be able to write
+        if not folder.is_symlink() and not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             folder.chmod(stat.S_IMODE(folder.stat().st_mode) | stat.S_IRWXU)
     signs = [part / _UNFINISHED, part / SUMS]
     names = files_below(part) if signs[0].exists() else [part / name for name in read_sums(part) or ()]

@@ -206,16 +206,21 @@ def test_rights_that_were_taken_away_stay_so(tmp_path: Path) -> None:
 @pytest.fixture
 def shared() -> Iterator[Path]:
     """A folder of an ordinary user, who obeys rights: root may write everywhere."""
-    root = os.geteuid() == 0
+    own = os.getresuid()
     with tempfile.TemporaryDirectory() as name:
         Path(name).chmod(0o777)
-        if root:
-            os.setresuid(65534, 65534, 0)
+        os.setresuid(*((65534, 65534, 0) if own[1] == 0 else own))
         try:
             yield Path(name)
         finally:
-            if root:
-                os.setresuid(0, 0, 0)
+            os.setresuid(*own)
+
+
+def test_replaced_results_of_a_colleague_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_folder(tmp_path / "report", {"a.html": "1", "figures/a.svg": "1"})
+    monkeypatch.setattr(Path, "chmod", lambda *_: 1 / 0)  # only the owner can change rights
+    outputs._clear(tmp_path / "report")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_read_only_results_are_refused_at_once_and_leave_nothing(shared: Path) -> None:

@@ -178,11 +178,8 @@ def _predicted_unit(path: Path, data: FlightData) -> str:
         learned, marks = list(about[KEY]), list(map(str, about[MARKS]))
         units = {str(series["unit"]) for series in about["series"].values()}
     if is_training_data(data, learned, marks):
-        raise UsageError(
-            "the prediction learned from this flight's own logs",
-            expected="a prediction made before the flight, or from other flights",
-            path=path.parent,
-        )
+        expected = "a prediction made before the flight, or from other flights"
+        raise UsageError("the prediction learned from this flight's own logs", expected=expected, path=path.parent)
     return units.pop() if len(units) == 1 else ""
 
 

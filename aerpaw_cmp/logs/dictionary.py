@@ -210,14 +210,14 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
         return None
     if row.unit and unit in UNITS and (UNITS[unit][0] != row.unit) and row.role in ("position", "angle", "velocity"):
         unit = ""  # the W of 'Longitude (W)' is not watts, and the m of 'vel_n_m_s' is not metres
-    rat = "nr" if PATTERNS["nr"].search(text) else "lte" if PATTERNS["lte"].search(text) else ""
+    rat = "nr" if has("nr", text) else "lte" if has("lte", text) else ""
     digits = PATTERNS["number"].search(re.sub(r"\b[45] ?g\b", "", text))
     number = next((group for group in digits.groups() if group), "0") if digits else "0"
     second = PATTERNS["secondary"].search(text)
-    place = f"n{number}" if PATTERNS["neighbour"].search(text) else f"scell{second[1]}" if second else "serving"
+    place = f"n{number}" if has("neighbour", text) else f"scell{second[1]}" if second else "serving"
     if place == "serving" and (other := PATTERNS["other"].search(text)):
         place = (other[1] or other[2] or f"cell{other[3]}").replace(" ", "")
-    part = "mean" if PATTERNS["mean"].search(text) else "port" if PATTERNS["port"].search(text) else ""
+    part = "mean" if has("mean", text) else "port" if has("port", text) else ""
     return Meaning(row, unit, rat, place, indirect=has("indirect", text), part=part)
 
 
@@ -482,7 +482,7 @@ def like_levels(names: Iterable[str]) -> list[str]:
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [
         name for name, text in words.items()
-        if PATTERNS["like_a_level"].search(text) and not PATTERNS["unlike_a_level"].search(text)
+        if has("like_a_level", text) and not has("unlike_a_level", text)
         and not (electric and re.fullmatch(r"(.* )?(power|pwr)( m?w)?", text))
     ]  # fmt: skip
 
@@ -494,7 +494,7 @@ def has(kind: str, words: str) -> bool:
 
 def is_statistic(name: str) -> bool:
     """Check whether a name contains a word for a mean, a maximum or a prediction."""
-    return any(PATTERNS[kind].search(plain(name)) for kind in ("mean", "indirect"))
+    return any(has(kind, plain(name)) for kind in ("mean", "indirect"))
 
 
 def can_be_level(name: str) -> bool:

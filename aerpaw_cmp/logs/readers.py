@@ -310,7 +310,7 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
     levels = [
         name for i, name in enumerate(names)
         if not known[i] and rows and all(_NEGATIVE.fullmatch(row[i]) for row in rows)
-        and not dictionary.PATTERNS["unlike_a_level"].search(dictionary.plain(name))
+        and not dictionary.has("unlike_a_level", dictionary.plain(name))
     ]  # fmt: skip
     times = [name for i, name in enumerate(names) if rows and all(_CLOCK.search(row[i]) for row in rows)]
     names = [name for name in names if not re.search(elsewhere, dictionary.plain(name))]

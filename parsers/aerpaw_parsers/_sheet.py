@@ -457,12 +457,13 @@ class Sheet:
         if gains:
             text = "changes, and levels are not corrected for it: do they already include it?"
             said.append(f"column {self.names[gains[0]]!r} {text}")
-        beside = {i: self.lines.text(i).strip('#%;" ') for i in self.blank_rows.tolist() if len(self)}
+        # a long log may have many comments between its rows
+        near = (i for i in self.blank_rows.tolist() if len(self) and (i < TITLES or 0 < i - self.row[-1] <= TITLES))
+        beside = {i + 1: self.lines.text(i).strip('#%;" ') for i in near}
         said += [
-            f"line {i + 1} is not read: {text[:80]!r}"
-            for i, text in beside.items()
-            if dictionary.has("of_values", text)
-            and not (TITLES <= i < self.row[-1] or text.startswith(self.names[0] or "?"))
+            f"line {number} is not read: {text[:80]!r}"
+            for number, text in beside.items()
+            if dictionary.has("of_values", text) and not text.startswith(self.names[0] or "?")
         ]
         equal = len(self) - len({*map(tuple, self.cells)})
         if equal > _MOST_EQUAL * len(self):

@@ -527,9 +527,8 @@ def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[
 
 def check_study(place: Site, settings: MapSettings) -> None:
     """Refuse a study of fewer than two rank heights, or unknown materials, before any map is computed."""
-    for name in sorted(
-        {place.ground_material, *(item.material for item in place.buildings)} if settings.max_depth else ()
-    ):
+    solids = {place.ground_material, *(building.material for building in place.buildings)}
+    for name in sorted(solids) if settings.max_depth else ():
         material(name).relative_permittivity(settings.carrier_hz)
     studied = settings.study and not settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m))
     heights = [height for height in settings.rank_altitudes_m if height >= interpolation.LOWEST_M]

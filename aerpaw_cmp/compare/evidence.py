@@ -148,7 +148,7 @@ def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
-    # compare with the next level: if levels are rounded, all are frequent, but the lowest is rarer than the next
+    # rounded levels all occur often: the lowest one is a floor only if it occurs at least as often as the next one
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
     # levels that the log repeats are one reading
     usual_run = 1.0 + 2.0 * np.median(ages(np.arange(len(level)), level)[~at]) if not at.all() else 1.0

@@ -341,7 +341,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
     Raises
     ------
     UnknownName
-        If no learned model has the name, or only one for the other end.
+        If no learned model has the name, or if the only model with this name is for the other end of the link.
     UsageError
         If a key of ``antennas`` is neither ``uav`` nor ``TOWER.CHANNEL``.
     """

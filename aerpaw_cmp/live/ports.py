@@ -609,8 +609,8 @@ class Schedule:
 class Stop:
     """A request to end, from a signal or another thread. It wakes the waiting tap.
 
-    As a context it reacts to SIGINT, SIGTERM and SIGHUP, and is closed at the end. Only the main thread receives
-    signals, and an ignored signal (nohup) stays ignored.
+    Inside a ``with`` block, SIGINT, SIGTERM and SIGHUP request the end; the block closes the request when it ends. Only
+    the main thread receives signals, and an ignored signal (nohup) stays ignored.
     """
 
     def __init__(self) -> None:

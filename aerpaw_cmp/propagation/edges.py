@@ -526,7 +526,7 @@ class _Search:
 
 
 class _End(NamedTuple):
-    """One end of paths in the space where its leg is straight.
+    """One end of each path, mirrored so that the leg from it to the edge is straight.
 
     ``centre_m`` (paths, 3); ``axes`` (paths, 3, 3) of the device as rows. ``normal`` (paths, 3) and ``face`` (paths, 3)
     belong to the leg's mirror, and ``bounced`` (paths,) is True if there is a mirror. Positions (paths or 1, 3,

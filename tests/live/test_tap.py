@@ -1,7 +1,7 @@
 """The tap on real pseudo-terminals: what it writes, what it survives, how it ends."""
 
-import json
 import os
+import re
 import signal
 import threading
 import time
@@ -322,9 +322,11 @@ def test_personal_data_never_reach_the_log(modem, tap, tools, tmp_path):
     session.wait(lambda: len(sim.journal) > count + 10)
     assert session.end().redacted == 6
     text = "".join(path.read_text() for path in (tmp_path / "log").iterdir())
-    for secret in ("4915123", "490154203", "00101012", "894902", "secret"):
-        assert secret not in text
-    assert sum(r["kind"] == "unsolicited" for r in map(json.loads, text.splitlines())) == 6
+    # time stamps, checksums and identifiers can contain a few digits of a number by chance
+    answers = re.sub(r'"(\w+_ns|crc|session|boot_id)":"?[\w-]+', "", text)
+    for secret in ("4915123", "490154", "00101012", "894902", "secret"):
+        assert secret not in answers
+    assert text.count('"kind":"unsolicited"') == 6
 
 
 def test_predictions_stand_beside_the_answers(modem, tap, tools, tmp_path):

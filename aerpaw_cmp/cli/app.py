@@ -81,7 +81,7 @@ _OF_RUN = {
 
 
 def of_run(out: str, *names: str, metavar: str = "DIR") -> dict[str, Any]:
-    """Return the options that fill the :class:`RunOptions` of a command: ``--out`` with its help, then others."""
+    """Return the options that fill the :class:`RunOptions` of a command: ``--out``, then those with the given names."""
     return {"out": Annotated[Path | None, output(out, metavar)]} | {name: _OF_RUN[name] for name in names}
 
 
@@ -104,7 +104,7 @@ def command(
     of : typer.Typer
         The app to which the command is added: the program, or a group such as ``site_app``.
     text : str, optional
-        One line of help; the default is that of :data:`aerpaw_cmp.common.text.COMMANDS`.
+        One line of help. The default is the line in :data:`aerpaw_cmp.common.text.COMMANDS`.
     kind : type, optional
         Class that reads the arguments.
     options : mapping, optional
@@ -135,7 +135,7 @@ def _bare(hint: Any) -> Any:
 
 
 def _with_common_options(function: Callable[..., Any], of_run: Mapping[str, Any]) -> Callable[..., Any]:
-    """Add the options of its run, ``--json`` and ``--quiet`` to a command, and let interrupts reach ``cli.main``."""
+    """Add ``--json``, ``--quiet`` and the options of :func:`of_run` to a command. Let interrupts reach ``cli.main``."""
 
     @functools.wraps(function)
     def run(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Common parts of NetCDF files after the CF conventions: units, reference systems, the file."""
+"""Parts that all NetCDF files share, according to the CF conventions: units, reference systems, the file."""
 
 from __future__ import annotations
 
@@ -119,12 +119,12 @@ class Dataset:
 
 
 def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
-    """Return a NetCDF-4 file of a :class:`Dataset`. It is made in memory, because HDF5 ends the process on a full disk.
+    """Return a NetCDF-4 file of a :class:`Dataset`. It is created in memory, because HDF5 aborts on a full disk.
 
     Arrays are deflated. Text becomes characters in UTF-8, which every reader of CF files accepts. NetCDF has no complex
-    numbers: ``NAME_real`` and ``NAME_imag`` are written instead of ``NAME``. The ``_FillValue`` of a variable
-    with NaN is NaN. Other variables have a ``_FillValue`` only if their ``encoding`` contains one. ``grows`` are
-    dimensions without a limit; :class:`GrowingNetcdf` appends along the first of them.
+    numbers: ``NAME_real`` and ``NAME_imag`` are written instead of ``NAME``. The ``_FillValue`` of a variable with NaN
+    is NaN. Other variables have a ``_FillValue`` only if their ``encoding`` contains one. ``grows`` are the unlimited
+    dimensions. :class:`GrowingNetcdf` appends along the first of these.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
         if {*dims} & {*grows}:
             encoding["chunksizes"] = (64,) * len(dims) if values.dtype.kind == "S" else _chunk(dims, values, grows)
         made = book.createVariable(name, values.dtype, dims, fill_value=encoding.pop("_FillValue", None), **encoding)
-        # the values are already packed, and netCDF4 would scale them again
+        # the values are already packed: do not let netCDF4 scale them again
         made.set_auto_maskandscale(False)
         made.setncatts(attributes)
         made[...] = values
@@ -159,7 +159,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
 
 
 def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple[int, ...]:
-    """Return the shape of a chunk of about 1 MiB or less. Only the first dimension that grows is longer than 1."""
+    """Return the shape of a chunk of about 1 MiB or less. Along other unlimited dimensions than the first it is 1."""
     sizes = dict(zip(dims, values.shape, strict=True))
     fixed = math.prod(size for name, size in sizes.items() if name not in grows)
     step = max(1, min(sizes.get(grows[0], 1), (1 << 20) // max(values.dtype.itemsize * fixed, 1)))
@@ -174,14 +174,13 @@ class GrowingNetcdf:
     ----------
     path : Path
     grows : sequence of str
-        Dimensions without a limit. Data sets follow each other along the first dimension. Along the other dimensions,
-        shorter data sets are filled with ``_FillValue``. A variable without the first dimension is overwritten by each
-        data set.
+        Unlimited dimensions. Data sets are appended along the first of these. Along the other dimensions, shorter data
+        sets are filled with ``_FillValue``. A variable without the first dimension is overwritten by each data set.
 
     Notes
     -----
-    A ``_FillValue`` other than NaN fills the file and is then removed from the attributes: it is a value (a gain of
-    0, a flag of -1), which readers would replace by NaN.
+    A ``_FillValue`` other than NaN fills the file. It is then removed from the attributes, because it is a valid value,
+    such as a gain of 0 or a flag of -1, which readers would otherwise replace by NaN.
     """
 
     def __init__(self, path: Path, grows: Sequence[str]) -> None:
@@ -261,7 +260,7 @@ def library(name: str) -> Any:
     Raises
     ------
     UsageError
-        If it is not installed.
+        If the module is not installed.
     """
     try:
         return importlib.import_module(name)

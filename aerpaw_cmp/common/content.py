@@ -1,7 +1,6 @@
 """SHA-256 of the content of records, arrays and shapes, used as cache key.
 
-The module also reads the list of training logs in a learned file, which contains their SHA-256 and fingerprints
-(marks).
+The module also reads the training logs that a learned file lists by their SHA-256 and their fingerprints (``marks``).
 
 No learned model is scored on its training logs. The name, folder or archive of a log may change. It is therefore
 identified by its SHA-256, or by its fingerprints if its bytes were changed (:mod:`aerpaw_cmp.flight.training`).
@@ -48,12 +47,12 @@ def _feed(digest: Any, value: Any) -> None:
         digest.update(repr(value).encode() + b"\n")
 
 
-# Keys in YAML and JSON files. The comments of a table have a colon after them.
+# Keys in YAML and JSON files. In the comments of a table, a colon follows the key.
 KEY, MARKS = "trained_on", "marks"
 
 
 def _listed(text: str, key: str, entry: str) -> tuple[str, ...]:
-    """Return the entries after a key in YAML lists of either style, arrays of JSON and comments of tables."""
+    """Return the entries after a key in YAML lists of either style, JSON arrays, and comments of tables."""
     lists = re.findall(key + rf"""["']?[ \t]*:[\s\["',-]*((?:{entry}[\s"',#-]*)+)""", text)
     return union(*(re.findall(entry, part) for part in lists))
 

@@ -166,7 +166,7 @@ _IN_WORDS: dict[Any, str] = {
 }
 
 
-# Exceptions that are bugs of this package, not errors in a file, if a line of this package raised them.
+# An exception of these classes is a bug of this package, not an error in a file, if a line of this package raised it.
 _FAULTS = (TypeError, AttributeError, NameError, AssertionError, NotImplementedError, ImportError)
 
 
@@ -176,9 +176,9 @@ def parsing(
 ) -> Iterator[None]:
     """Convert exceptions that a parser raises because of a file's content into :class:`InputError` about that file.
 
-    Libraries raise two dozen kinds of exceptions for damaged files, such as RecursionError for a nested JSON, csv.Error
-    for a long cell, struct.error, and MemoryError for a forged length. Only use this context for reading, not for
-    computations.
+    Libraries raise two dozen kinds of exceptions for damaged files, such as RecursionError for deeply nested JSON,
+    csv.Error for a long cell, struct.error, and MemoryError for a forged length. Only use this context for reading, not
+    for computations.
 
     Parameters
     ----------
@@ -335,7 +335,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     words = [word for word in arguments[:2] if not word.startswith("-")]
     command = " ".join(["aerpaw-cmp", *words[: 2 if words[:1] in (["site"], ["antenna"]) else 1]])
     place = None if error.path is None else Path(error.path)
-    if place is not None and not _exists(place):  # the name in the flight file
+    if place is not None and not _exists(place):  # the path may be relative to a settings file
         candidates = (Path(word).parent / place for word in arguments if word.endswith(_SETTINGS))
         place = next(filter(_exists, candidates), place)
     if "there is no telemetry log" in error.found:
@@ -369,7 +369,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         line = "" if error.line is None else f", line {error.line},"
         return f"fix {one_line(place.name)}{line} and run the same command"
     if place is not None and error.expected == "a YAML file" and _exists(place) and place.is_dir():
-        # a folder of 'calibrate' is next to the file with its settings
+        # the user may have named a folder of 'calibrate' instead of the settings file next to it
         beside = [path for path in (place.parent / f"{place.name}.yaml",) if _exists(path)]
         settings = beside or sorted(path for path in place.iterdir() if path.suffix in _SETTINGS)
         if len(settings) == 1:
@@ -379,7 +379,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if extra := re.match(r"Got unexpected extra argument\S* \((.+)\)", error.found):
         return f"the same command without {one_line(extra[1])}"
     settings_file = next((word for word in arguments if word.endswith(_SETTINGS)), None)
-    # a log without a time zone is correct: the key is missing in the settings
+    # a log without a time zone is not wrong: the key must be added to the settings
     in_file = place is None or "timezone:" in (error.expected or "")
     if in_file and settings_file and words[:1] in _OF_SETTINGS and "--" not in error.found:
         return f"fix {one_line(Path(settings_file).name)} and run the same command"
@@ -402,7 +402,7 @@ def _step_for(place: Path, error: AerpawCmpError, command: str, arguments: Seque
     if not place.is_file():
         return f"'ls -l {typed(place)}' shows what is there"
     if words[:1] == ["ingest"]:
-        # a recognised file, or a hint about columns, already contains the next step
+        # if the file is recognised, or the cause explains --map, the message already contains the next step
         unknown = "no reader recognises" in error.found and "--map" not in (error.cause or "")
         return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):

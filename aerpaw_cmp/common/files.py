@@ -60,7 +60,7 @@ def inside(
 def cache_folder(*parts: str) -> Path:
     """Return a path in the cache folder, which contains only data that this program can compute again.
 
-    The folder is ``AERPAW_CMP_CACHE`` or in the user's cache: ``XDG_CACHE_HOME``, else ``~/.cache``.
+    The folder is ``AERPAW_CMP_CACHE`` if that is set, otherwise a folder in ``XDG_CACHE_HOME`` or ``~/.cache``.
     """
     chosen = os.environ.get("AERPAW_CMP_CACHE")
     folder = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "aerpaw-cmp")
@@ -101,7 +101,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
     OSError
         If the folder is missing, full or not writable.
     """
-    # a name has at most 255 bytes, and mkstemp adds some
+    # the limit of a name is 255 bytes, and mkstemp adds a random suffix
     prefix = f".{target.name[:40]}."
     _clear_old_parts(target.parent, prefix)
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")

@@ -1,8 +1,8 @@
 """Gaussian processes: a kernel, the points that determine a process, and predictions from known values.
 
-A process is given by covariances alone. ``C`` is the covariance of the known values (including their noise), ``K`` that
-of targets with them, and ``L L' = C``. With the white values ``L^-1 y`` of known ``y`` every prediction is a product
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1).
+A process is given by covariances alone. ``C`` is the covariance of the known values (including their noise), ``K`` is
+the covariance of the targets with the known values, and ``L L' = C``. Every prediction is a product with the white
+values ``L^-1 y`` of known ``y`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1).
 """
 
 from __future__ import annotations

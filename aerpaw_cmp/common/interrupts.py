@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # Signals that end a command after it has cleaned up.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# The exit code is this plus the number of the signal.
+# The exit code after a signal is this number plus the number of the signal.
 SIGNALLED = 128
 
 # Functions to call when :func:`noted` ends: they remove hidden files whose creation was interrupted.
@@ -48,7 +48,7 @@ _last: int = signal.SIGINT
 
 
 def interrupted() -> bool:
-    """Check whether an interrupt came since :func:`noted` began. False outside that context."""
+    """Check whether an interrupt occurred since :func:`noted` began. False outside that context."""
     return _signalled
 
 
@@ -76,7 +76,7 @@ def noted() -> Iterator[None]:
     Raises
     ------
     KeyboardInterrupt
-        If an interrupt came and became another exception, which is then the cause.
+        If an interrupt became another exception, which is then the ``__cause__``.
     """
     global _signalled, _last
     ours = _set(SIGNALS, _note)
@@ -85,7 +85,7 @@ def noted() -> Iterator[None]:
         return
     _last = signal.SIGINT
     previous = sys.unraisablehook
-    # Python prints a traceback for exceptions that it ignores, but this interrupt is not lost
+    # do not let Python print that it ignored the interrupt: it is raised later
     sys.unraisablehook = lambda what: None if what.exc_type is KeyboardInterrupt else previous(what)
     try:
         with _watched():
@@ -146,7 +146,7 @@ def _watched() -> Iterator[None]:
 
 
 def _watch(signals: int, ended: threading.Event) -> None:
-    """End the process if a signal came, is not held, and Python could not run its handler for ``PATIENCE_S``."""
+    """End the process if a signal is not delayed and Python could not run its handler for ``PATIENCE_S``."""
     while number := os.read(signals, 1):
         if not ended.wait(PATIENCE_S) and not _signalled and signal.getsignal(number[0]) is _note:
             _clear()

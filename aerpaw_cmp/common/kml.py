@@ -1,4 +1,4 @@
-"""Reading of third-party KML and writing of KMZ: coordinates, marks, lines, legends and the archive.
+"""Reading of third-party KML and writing of KMZ: coordinates, placemarks, lines, legends and the archive.
 
 Logs in KML are read by pattern, line by line (:data:`DATA`, :data:`POINT`): each line has to be counted, even in a
 truncated file. Maps and routes are read as XML.
@@ -34,7 +34,7 @@ def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Eleme
     # UTF-16 would hide entities from this check
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
         raise InputError("the XML declares entities, or is not UTF-8", expected=expected, path=path)
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # a KML with gx:Track and no xmlns:gx is common
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # accepts the common gx:Track without xmlns:gx
     # request the text of an element in one piece: otherwise expat returns it line by line
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
@@ -80,7 +80,7 @@ _DPI = 110
 # --- reading -------------------------------------------------------------------------------------------------------
 
 # A named value and the first position of a shape, on a line of a log. Repeats are bounded: a third-party line may be
-# megabytes long, and each start would search all of it.
+# megabytes long, and unbounded repeats would search all of it from each start.
 DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
 _DECIMAL = rb"([-+]?[\d.]{1,20})"
 POINT = re.compile(rb"<coordinates>\s{0,40}%b,\s?%b(?:,\s?%b)?" % (_DECIMAL, _DECIMAL, _DECIMAL))

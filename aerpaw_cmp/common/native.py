@@ -1,10 +1,10 @@
 """Reading of third-party files in native formats (HDF5, GeoTIFF), in a child process that cannot open other files.
 
 Libraries of these formats are C code. A malicious file can make them open other files (external storage and links,
-virtual data sets, VRT), run forever, or read beyond the end of a buffer. The child gets the bytes of the file, loads
-its library, and then gives up its rights. It cannot create any further descriptor (RLIMIT_NOFILE 0: no file, socket or
-process pipe), use more than ``_MOST_MEMORY``, or more than ``SECONDS`` of processor time. Only then does it read the
-bytes. The result is a list of plain arrays.
+virtual data sets, VRT), run forever, or read beyond the end of a buffer. The child receives the bytes of the file,
+loads the library, and then drops its privileges. After that, it cannot create a descriptor (RLIMIT_NOFILE 0: no file,
+socket or process pipe), use more than ``_MOST_MEMORY``, or more than ``SECONDS`` of processor time. Only then does it
+read the bytes. The result is a list of plain arrays.
 
 Without a ``resource`` module (Windows) these limits do not apply, but the content of the file is still checked.
 """
@@ -97,7 +97,7 @@ def _unpacked(content: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
 
 def main(kind: str) -> None:
     """Read a file from standard input and write its arrays to standard output."""
-    # load libraries first: without the rights they could not be loaded
+    # load libraries first: after the privileges are dropped, they could not be loaded
     reader = READERS[kind]()
     data = sys.stdin.buffer.read()
     give_up_rights()
@@ -124,7 +124,7 @@ def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
 
 
 def give_up_rights() -> None:
-    """Remove this process's rights to open files and to use much memory and time."""
+    """Drop this process's privileges to open files and to use much memory and time."""
     try:
         import resource
     except ImportError:

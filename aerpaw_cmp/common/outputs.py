@@ -6,7 +6,7 @@ The two kinds of result follow the same rule:
 kind                   proof that this tool wrote it                            how the new output gets the name
 =====================  =======================================================  ==================================
 :class:`OutputFile`    a seal inside: the SHA-256 of the rest of the file       written nearby, synced, renamed
-:class:`OutputFolder`  ``SHA256SUMS`` in it: the SHA-256 of every file of it    filled nearby, synced, swapped
+:class:`OutputFolder`  ``SHA256SUMS`` in it: the SHA-256 of every file in it filled nearby, synced, swapped
 =====================  =======================================================  ==================================
 
 An input is never replaced, with or without ``--force``. Inputs are compared by device and inode, so links are

@@ -89,7 +89,7 @@ class Plan:
         }
 
 
-class NotRun(Exception):  # noqa: N818  # the end that a dry run has, no error
+class NotRun(Exception):  # noqa: N818  # not an error: a dry run ends with it
     """The exception at the point where a dry run would begin to compute. ``plan`` contains what a run would do."""
 
     def __init__(self, plan: Plan) -> None:

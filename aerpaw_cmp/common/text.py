@@ -59,7 +59,7 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 # would otherwise remove it
 _BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
 _GUARDED = re.compile(r"(^|;)'")
-# In a comment a cell also begins after a separator. Numbers are not guarded, because some comments contain tables of
+# In a comment a cell also begins after a separator. Numbers are not guarded, because comments may contain tables of
 # numbers.
 _IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
 

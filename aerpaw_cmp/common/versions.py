@@ -43,12 +43,12 @@ def commit() -> str:
     ask = ["git", "-C", str(package.parent), "describe", "--tags", "--always", "--long", "--abbrev=7"]
     try:
         # do not use a shell, because the path of a checkout may contain spaces and quotes
-        told = subprocess.run(
+        described = subprocess.run(
             [*ask, "--dirty=.dirty", "--match", release], capture_output=True, text=True, check=True, timeout=10
         )
     except (OSError, subprocess.SubprocessError):
         return UNKNOWN
-    answer = told.stdout.strip()
+    answer = described.stdout.strip()
     # a release is a clean checkout of its tag: no later commits and no ".dirty"
     return "" if answer.startswith(f"{release}-0-g") and "." not in answer[len(release) :] else answer.split("-g")[-1]
 
@@ -56,7 +56,7 @@ def commit() -> str:
 # File of a wheel, next to the package's other files.
 COMMIT_FILE = "commit.txt"
 
-# A checkout without Git, or one that Git distrusts, is not a release either.
+# A checkout is also not a release if Git is not installed, or does not trust its folder.
 UNKNOWN = "unknown"
 
 

@@ -98,7 +98,7 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
     from ...compare.statistics import FEWEST
 
     channels = [m for channels in metrics["rss"].values() for m in channels.values()]
-    # a channel that is not scored because its antenna was learned on this log is not a failure
+    # if the antenna of a channel was learned on this log, the channel is deliberately not scored
     most = max([m["n"] for m in (*channels, *metrics["rank"].values())], default=0)
     if most >= FEWEST or any(m.get("trained_on") for m in channels):
         return 0

@@ -243,7 +243,7 @@ def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
     from ...maps.grid import JOINT
 
     lines: dict[tuple[str, str], dict[str, str]] = {}
-    alone = len({row["tower"] for row in rows}) == 2  # one tower is always the nearest one
+    alone = len({row["tower"] for row in rows}) == 2  # a single tower is always the nearest tower
     for row in (row for row in rows if row["foliage"] == settings.shown and not (alone and row["tower"] == JOINT)):
         tower = "nearest tower" if row["tower"] == JOINT else row["tower"]
         antennas = "one element" if row["antennas"] == "SISO" else f"{settings.elements} elements in phase"

@@ -45,7 +45,7 @@ SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_le
 class Observed:
     """The samples of a series, with additional data that are needed to score it.
 
-    ``free_space_db`` (n,): level of free space for the transmit power ``sent_dbm`` [dB]. ``heading_deg`` (n,): heading
+    ``free_space_db`` (n,): free-space level at the transmit power ``sent_dbm`` [dB]. ``heading_deg`` (n,): heading
     of the nose [deg]. ``tower_m`` (n, 3): positions of a moving tower [m]. ``start``: time of ``time_s`` 0 (UTC) or
     None. ``locked`` (n,): receiver lock, 1 locked, 0 not locked, NaN unknown.
     """
@@ -59,7 +59,7 @@ class Observed:
     sent_dbm: float = 0.0
 
     def part(self, keep: BoolArray | IntArray) -> Observed:
-        """Return some of the samples."""
+        """Return the selected samples."""
         return dataclasses.replace(
             self,
             samples=self.samples.part(keep),
@@ -79,8 +79,7 @@ class Recipe:
     model : GainModel
         Terms, and initial values of their strengths.
     patterns : mapping of str to callable
-        Gain of measured patterns in the device frame, for ``uav`` and antennas (``tower.channel``). The mapping can be
-        empty.
+        Gains of measured patterns in the device frame, by ``uav`` and antenna (``tower.channel``). May be empty.
     """
 
     model: gains.GainModel
@@ -95,7 +94,7 @@ class Mounted:
     mounts: Mapping[str, gains.MountFit]
 
     def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
-        """Return the gain (n,) of a mounted pattern towards directions (n, 3) in the frame of body or mast.
+        """Return the gain (n,) of a mounted pattern towards directions (n, 3) in the body or mast frame.
 
         The gain is 0 for an antenna without a pattern.
         """
@@ -106,7 +105,7 @@ class Mounted:
         return pattern(direction if mount is None else direction @ turned(mount.azimuth_deg))
 
     def patterns_db(self, samples: LinkSamples) -> FloatArray:
-        """Return the gain (n,) of the measured patterns of both ends."""
+        """Return the sum (n,) of the gains of the measured patterns of both ends [dB]."""
         return self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
 
 
@@ -151,7 +150,7 @@ class Learned(Mounted):
         return self.patterns_db(samples) + _mean_along(self.fit, samples)
 
 
-# Averaging time within which a UAV hardly turns [s].
+# Averaging time [s]. A UAV hardly turns within it.
 _FINE_S = 0.5
 
 
@@ -160,13 +159,13 @@ def _mean_along(fit: gains.GainFit, samples: LinkSamples) -> FloatArray:
     at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(_FINE_S)
     if not len(at):
         return np.full(len(samples), np.nan)
-    # compute few means, because each mean requires a row of kernels
+    # evaluate the gain only at these means: each evaluation requires a row of the kernel matrix
     gain = np.interp(samples.time_s, at.time_s, fit.mean(at))
     return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
 
 
 def learn(series: Sequence[LinkSamples], recipe: Recipe, model: gains.GainModel | None = None) -> Learned:
-    """Fit the mounts of the patterns, then the gain over direction that remains.
+    """Fit the mounts of the measured patterns, then a gain over direction to what they do not explain.
 
     Parameters
     ----------
@@ -181,7 +180,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: gains.GainModel 
     mounted = Mounted(recipe.patterns, gains.fit_mounts(series, patterns) if patterns else {})
     residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
     fit = gains.chosen_fit(residuals, recipe.model) if model is None else gains.fit_gain(residuals, model)
-    if any(s.floor_db is not None for s in series):  # a third fit would not change held-out errors
+    if any(s.floor_db is not None for s in series):  # a third fit does not change held-out errors
         fit = gains.fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: gains.fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
@@ -206,9 +205,9 @@ def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: gains.GainFit) ->
 class Score:
     """The error of one held-out flight and channel after one offset [dB].
 
-    ``rmse_4s_db``: RMSE after averaging the power of both sides over 4 s. ``inside_50``, ``inside_90``, ``inside_95``:
-    share of a few hundred samples inside the 50, 90 and 95 % interval. ``offset_db``: mean of measured minus predicted.
-    ``rmse_shared_offset_db``: RMSE with the mean offset of the training flights. ``constant_rmse_db``,
+    ``rmse_4s_db``: RMSE after averaging measured and predicted power over 4 s. ``inside_50``, ``inside_90``,
+    ``inside_95``: share of a few hundred samples inside the 50, 90 and 95 % interval. ``offset_db``: mean of measured
+    minus predicted. ``rmse_shared_offset_db``: RMSE with the mean offset of the training flights. ``constant_rmse_db``,
     ``log_distance_rmse_db``: RMSE of a constant, and of a straight line over log distance. The flight is divided into
     eight areas, and the slope of the line in each area is fitted to the other areas. If parts of a flight are scored,
     the offset of every model and the slope of the line are fitted outside the part.
@@ -239,8 +238,8 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     gain_db : (n,)
         Predicted level above free space [dB]. NaN is not scored.
     simple : Simple, optional
-        Baselines with offsets fitted outside each scored part, as for ``gain_db``. By default, every baseline has one
-        offset for the whole flight.
+        Baselines whose offsets were fitted outside each scored part, as that of ``gain_db`` was. By default, every
+        baseline has one offset for the whole flight.
 
     Returns
     -------
@@ -280,7 +279,7 @@ STEEPEST = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Simple:
-    """The models without antennas, each (n,) [dB]: offset of free space, a constant and a line over log distance."""
+    """The predictions of the baselines, each (n,) [dB]: free-space offset, constant, line over log distance."""
 
     free_db: FloatArray
     constant_db: FloatArray
@@ -344,7 +343,7 @@ def flight_left_out(
 
 
 def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: float = 0.0) -> tuple[Score, ...]:
-    """Score levels of each campaign, predicted with the UAV gain of other campaigns with the same airframe only.
+    """Score levels of each campaign, predicted only with the UAV gain from other campaigns with the same airframe.
 
     Campaigns are omitted if no other campaign has their airframe.
 
@@ -378,12 +377,13 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
 
-# Number of samples per series whose standard deviation is checked: it takes a thousand times longer than a mean.
+# Number of samples per series whose standard deviation is checked. Computing it takes a thousand times longer than a
+# mean.
 _SPREAD_SAMPLES = 400
 
 
 def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score]:
-    """Yield scores at antennas with a known offset, with their own offset and with that of the other flights."""
+    """Yield scores with the offset of the scored flight and with that of the training flights, where both are known."""
     for o in unseen:
         if o.samples.antenna not in offsets:
             continue
@@ -403,7 +403,7 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
         yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
 
 
-# Largest number of flights that are scored part by part. If there are more, an evenly spaced selection of them is
+# Largest number of flights that are scored part by part. If there are more flights, an evenly spaced selection is
 # scored.
 _MOST_SCORED = 6
 
@@ -482,7 +482,7 @@ def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, 
 
 
 def cruise_height_m(observed: Observed) -> float:
-    """Return the most frequent height of a flight, to a metre [m]."""
+    """Return the most frequent height of a flight, rounded to a metre [m]."""
     heights, count = np.unique(np.round(observed.samples.position_m[:, 2]), return_counts=True)
     return float(heights[count.argmax()])
 
@@ -556,7 +556,7 @@ OFF = "no correction"
 _NUISANCE = ("drift_sd_db", "drift_s", "noise_sd_db")
 
 # Lengths of the field over positions. Drift and noise are always fitted. With few flights, the likelihood confuses
-# position with direction and height: fitted lengths increased the error on held-out flights by 0.3 dB.
+# position with direction and height: fitting the lengths increased the error on held-out flights by 0.3 dB.
 _STARTS: dict[str, FieldModel | None] = {
     OFF: FieldModel(place_sd_db=1e-3, turn=math.inf, drift_s=8.0),
     "field of 2 dB, 30 m": FieldModel(place_sd_db=2.0, length_m=30.0, height_m=20.0, turn=0.35, drift_s=8.0),
@@ -568,7 +568,7 @@ _STARTS: dict[str, FieldModel | None] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Channel:
-    """The binned rows of one tower and channel over all flights, and a base's residuals (n,) at these rows [dB]."""
+    """The binned rows of one tower and channel over all flights, with the residuals (n,) of a base [dB]."""
 
     rows: Rows
     left_db: FloatArray
@@ -594,13 +594,13 @@ class Correction:
     crps_db, rmse_db : mapping of (base, title) to float
         CRPS and RMSE of held-out errors.
     held_out : mapping of (base, title) to ((n,), (n,))
-        Held-out errors and their standard deviations, in the same order for all candidates. NaN without a prediction.
+        Held-out errors and their standard deviations, in the same order for all candidates. NaN if not predicted.
     held_out_place_m : (n, 3), optional
         Positions of the samples of ``held_out`` [m].
     held_out_parts : tuple of (str, int)
         Flight and number of samples of each tower and channel in ``held_out``, in its order.
     sd_factor : float
-        Factor applied to all standard deviations, so that they agree with the held-out errors. Each candidate of
+        Factor by which all standard deviations are multiplied to agree with the held-out errors. Each candidate of
         ``held_out`` has its own factor.
     fits : mapping of str to FieldFit
         The solved fields by antenna.
@@ -661,7 +661,7 @@ class Correction:
         if len(each) > 1:
             targets = dataclasses.replace(targets, direction=np.stack([s.at_uav for s in each], axis=1))
         if not self.on and flight not in self.flights and len(targets):
-            # without a field, all targets have the same solution, so one is enough
+            # without a field, all targets have the same standard deviation, so solve for a single target
             targets = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
         # solve once for each antenna, because maps are predicted tile by tile
         fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
@@ -683,7 +683,7 @@ def between_blocks_db(channel: Channel) -> float:
 
 
 def _channels(series: Sequence[LinkSamples], predictor: Predictor, flights: Sequence[str]) -> dict[str, Channel]:
-    """Return the residuals of a base by antenna."""
+    """Return the rows and the residuals of a base for each antenna."""
     parts: dict[str, list[Channel]] = {}
     for samples in series:
         binned = samples.binned(BIN_S)
@@ -729,7 +729,7 @@ def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
             for group in groups_of(names)[: None if len(names) <= MOST_GROUPS else _SCORED_GROUPS]
         ]
     size_m, every = 2.0 * BLOCK_M, np.empty(0)
-    while len(every) < 2 and size_m > 1.0:  # smaller blocks for a flight inside one block
+    while len(every) < 2 and size_m > 1.0:  # a short flight may lie inside one block
         size_m /= 2.0
         cells = [np.floor(s.position_m[:, :2] / size_m).astype(np.int64) for s in series]
         every, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
@@ -783,7 +783,7 @@ def _score_fold(
             tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
 
 
-# Titles of the residual fields with fixed lengths. Fitted lengths are not valid far from the flown positions.
+# Titles of the residual fields with fixed lengths. Fitted lengths do not apply far from the flown positions.
 STATED_FIELDS = tuple(title for title, start in _STARTS.items() if start is not None)
 
 
@@ -873,9 +873,9 @@ def crps_difference(
 def _sd_factor(flights: Sequence[str], parts: Sequence[_HeldOut]) -> float:
     """Return the ratio of actual to stated errors of held-out parts, limited to 0.8 to 1.6, or 1 without errors.
 
-    It is a geometric mean over flights. A model learned from flights with small errors states too little for a flight
-    with large errors, and the reverse. An arithmetic mean would give the first case more weight, although the final
-    model is fitted to both kinds.
+    It is a geometric mean over flights. A model that was learned from flights with small errors states a too small
+    error for a flight with large errors, and vice versa. An arithmetic mean would give more weight to the first case,
+    although the final model is fitted to all flights.
     """
     squares = lists_by_key(zip(flights, (np.square(error / sd) for error, sd in parts), strict=True))
     means = [_mean(np.concatenate(each)) for each in squares.values()]
@@ -895,7 +895,7 @@ def _mean(values: FloatArray) -> float:
 
 
 def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
-    """Return a base whose level above free space is known, so that nothing is learned."""
+    """Return a base with a known level above free space, which learns nothing from the samples."""
 
     def learn(_: Sequence[LinkSamples]) -> Predictor:
         return lambda samples: (gain(samples), np.zeros(len(samples)))

@@ -1,14 +1,14 @@
-"""Likely cause of a level error: a fault of the log, its settings or its site that explains the error by likelihood.
+"""Likely cause of a level error: the most likely fault of the log, its settings or the site.
 
 Each fault changes the predicted level in one of three ways: by known decibels, by columns with free coefficients, or at
 samples that the receiver clipped. Clipped samples are predicted by their own mean, and they fade less. The offset is
 fitted as well. The residual is noise with a long and a short correlation time, because slow fading is not a fault.
 
-An explanation is a single fault or a pair, and the second fault of a pair is searched in the residual of the first.
-Explanations are compared by their marginal likelihood over all channels. Coefficients, angles, heights, positions and
-times are averaged over their possible values, which penalises explanations with many free numbers. A fault is named if
-the explanations with it are likelier by a margin than all others, and if it reduces the RMSE as required. A paired test
-of two models is not used, because it would need flights much longer than the duration of a fault.
+An explanation is a single fault or a pair, and the second fault of a pair is searched for in the residual after the
+first. Explanations are compared by their marginal likelihood over all channels. Coefficients, angles, heights,
+positions and times are averaged over their possible values, which penalises explanations with many free numbers. A
+fault is named if the explanations that contain it are likelier than all others by a margin, and if it reduces the RMSE
+enough. A paired test of two models is not used, because it would need flights much longer than the duration of a fault.
 
 A new fault is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
 """
@@ -60,17 +60,18 @@ _UNNAMED = ""
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """A fault with its numbers, its effect on the level, and its words.
+    """A fault with its numbers, its effect on the level, and its sentence.
 
     ``change_db`` (n,) is added to the predicted level. ``columns`` (n, k) have free coefficients with a unit normal
-    prior. ``clipped`` (n,) are samples whose level is not that of the link. ``fading`` (n,) is the share of the link's
-    fading that the log shows. ``cost`` is the log likelihood lost by averaging over all possible numbers. A trial
-    without a name is an alternative that is not named as a cause.
+    prior. ``clipped`` (n,) marks samples whose level does not depend on the link. ``fading`` (n,) is the share of the
+    link's fading that the log shows. ``cost`` is the log likelihood lost by averaging over all possible numbers. A
+    trial without a name is an alternative that is not named as a cause.
 
     Parameters
     ----------
     channels : int
-        Number of channels of the tower that have the same numbers and share the cost of their search.
+        Number of channels of the tower that have the same fault with the same numbers, and share the cost of its
+        search.
     """
 
     name: str = _UNNAMED
@@ -86,7 +87,7 @@ class Trial:
 
     @cached_property
     def designs(self) -> tuple[Columns, ...]:
-        """The columns for fits, which share their whitened values. Empty without columns."""
+        """The columns for the fits, which share the whitened values of the columns. Empty if there are none."""
         return () if self.columns is None else (Columns(self.columns),)
 
 
@@ -136,7 +137,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             if any(either <= pair for pair in named):
                 continue
             lead = _lead(either, odds) / len(showing)
-            # an almost certain cause may leave an error without a certain name, so judge it with that error, too
+            # an almost certain cause may leave an error whose cause is not certain, so also judge it together with that
+            # cause
             apart = (beside, best) if lead >= _CERTAIN else (beside,)
             if any(all(_explains(other, showing, lead, rest - either) for other in either) for rest in apart):
                 named[either] = showing
@@ -157,14 +159,14 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
 
 
 def _likeliest_first(either: Set[str], best: Set[str], odds: Mapping[frozenset[str], float]) -> list[str]:
-    """Return the names of causes in an order that does not change from run to run, as that of a set does."""
+    """Return the names of causes, the likeliest first. The order of a set would change from run to run."""
     return sorted(either, key=lambda name: (name not in best, -_lead({name}, odds)))
 
 
 def _channels_showing(either: Set[str], best: Set[str], tables: Sequence[_Models]) -> list[_Models]:
     """Return the channels that must show a cause (or one of two causes), the clearest first."""
     name = max(either & best)
-    # the UAV has one height and one attitude, and a tower one place, so all their channels must show the error
+    # an error of the UAV's height or attitude, or of a tower's position, must appear on all of its channels
     of_all = all(_conditions(each).of_uav for each in either)
     shown = [table for table in tables if of_all or name in _names(_best(table, best))]
     if any(_conditions(each).of_tower for each in either):
@@ -175,7 +177,7 @@ def _channels_showing(either: Set[str], best: Set[str], tables: Sequence[_Models
 
 
 def _unpaid(models: Sequence[_Model]) -> float:
-    """Return the part of the search's cost that falls on channels without the fault.
+    """Return the part of the search cost that is charged to channels without the fault.
 
     All channels of a tower share the cost of a search for numbers that they have in common.
     """
@@ -185,7 +187,7 @@ def _unpaid(models: Sequence[_Model]) -> float:
 
 
 def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
-    """Return the cause after steps and offsets were compared with those of held-out flights.
+    """Return the cause after comparing steps and offsets with those of held-out flights.
 
     A fit within a flight cannot distinguish a step from slow fading. If the usual errors of all channels are known,
     they decide.
@@ -206,7 +208,7 @@ def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
         )
     if cause is not None:
         return None if cause.name == "gain step" and len(known) == len(tables) else cause
-    # a cable or a gain changes the offset alone
+    # a changed cable or gain changes only the offset
     healthy = all(_rmse_db([table[_SOUND]]) <= judged.health.most_rmse_db for judged, table in known)
     if healthy and len(known) == len(tables) and (off := level_of(channels)) is not None:
         side = "higher" if off.difference_db > 0 else "lower"
@@ -238,7 +240,7 @@ def _rivalled(step: Step, known: Sequence[tuple[Judged, _Models]]) -> bool:
         for names, model in table.items():
             if len(names) == 1 and "gain step" not in names:
                 columns = sum(0 if trial.columns is None else trial.columns.shape[1] for trial in model.trials)
-                # a free coefficient without any effect reduces the sum of squares by 1 on average
+                # even a free coefficient without a real effect reduces the sum of squares by 1 on average
                 fall = before - channel.square(model.residual_db) - columns
                 squares[max(names)] = squares.get(max(names), 0.0) + max(fall, 0.0)
     return max(squares.values(), default=0.0) > step.chi2 - _RARE
@@ -281,7 +283,7 @@ class _Conditions:
     share : float
         Smallest reduction of the RMSE, as a share.
     learned_share : float
-        The same with learned antennas, whose error is a few decibels on every flight.
+        The same for learned antennas, with which every flight has an error of a few decibels.
     part : float
         Smallest reduction of the error that remains after the other causes, as a share of the reduction by all
         candidates. It applies to flights without learned antennas.
@@ -290,7 +292,7 @@ class _Conditions:
     of_tower : bool
         True if the cause changes the levels of all channels of a tower.
     follows : float, optional
-        Largest remaining error as a share of that of a constant level, which fits a log of noise best.
+        Largest remaining error as a share of the error of a constant level, which fits a log of noise best.
     most_left : float
         Largest remaining error, as a multiple of the largest error of a held-out flight.
     """
@@ -332,7 +334,7 @@ def _conditions(name: str) -> _Conditions:
 
 
 def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]) -> bool:
-    """Check whether a cause lowers the RMSE as much as its conditions require, on the channels that show it.
+    """Check whether a cause lowers the RMSE by the required amount on the channels that show it.
 
     ``beside`` are the other causes of the likeliest explanation.
     """
@@ -340,14 +342,14 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     if not all(frozenset([name]) in table for table in shown):
         return False
     alone = [table[frozenset([name])] for table in shown]
-    # the cause alone must reduce the RMSE, not only changes between neighbouring samples
+    # the cause alone must reduce the RMSE, not only the differences between neighbouring samples
     if (need.of_uav or need.of_tower) and any(model.gain <= 0.0 for model in alone):
         return False
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone)
     before_db, after_db = (_rmse_db([_best(table, of) for table in shown]) for of in (beside, {*beside, name}))
     if lead < need.lead or known_db - alone_db < SHOWN_DB or not before_db:
         return False
-    # another cause may hide the effect of an almost certain one on the total error
+    # another cause may hide how much an almost certain cause reduces the total error
     hidden = bool(beside) and lead >= _CERTAIN
     share = after_db / before_db if hidden else max(alone_db / known_db, after_db / before_db)
     least_share = max(need.share, need.learned_share * (sound[0].evidence.antenna == "learned"))
@@ -358,11 +360,13 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     most = _MOST_IN_HALVES[usual is not None or alone_db <= _MOST_OF_ERROR * known_db]
     if name == CATCH_ALL and (known_db < _LEAST_DB or (lead < _SURE_GAIN and not _holds_in_halves(alone, most))):
         return False
-    # a floor that the settings remove is known, and explains why the remaining low links look too strong
+    # the settings already remove this floor, so it is not news, and the low links that remain look too strong because
+    # of it
     if name == "floor" and sound[0].evidence.floored:
         return False
     if usual is None:
-        # if a cause is almost certain, what all candidates remove beyond the likeliest explanation is fading
+        # if a cause is almost certain, attribute to fading what all candidates together remove beyond the likeliest
+        # explanation
         likeliest = [max(table.values(), key=lambda model: model.gain) for table in shown]
         left_db = _together_db(shown) if lead < _CERTAIN else _rmse_db(likeliest)
         enough = not need.part or after_db <= before_db - need.part * (before_db - left_db)
@@ -381,13 +385,13 @@ def _holds_in_halves(models: Sequence[_Model], most: float) -> bool:
     return bool(after <= most**2 * before)
 
 
-# A gain is fitted to one half of the flight. Largest ratio of the RMSE of the other half with the gain to that without
-# it. The second ratio applies to learned antennas, and to a gain after which at most the next share of the RMSE
-# remains, because halves of a short flight show few directions.
+# A gain is fitted to one half of the flight. Largest ratio of the RMSE of the other half with the gain to the RMSE
+# without the gain. The second ratio applies to learned antennas, and to a gain after which at most the next share of
+# the RMSE remains, because halves of a short flight show few directions.
 _MOST_IN_HALVES, _MOST_OF_ERROR = (0.75, 0.85), 0.5
-# Number of means per independent sample of the error. Halves may show different directions, so the test of halves is
-# skipped if the log odds per channel reach the second number. Learned antennas leave an error of 3 dB and more, so a
-# pattern is not the cause of an error below the last number [dB].
+# Number of means per independent sample of the error. Halves may have different directions, so the test of halves is
+# skipped if the log odds per channel reach the second number. Even learned antennas have an error of 3 dB and more, so
+# a pattern is not the cause of an error below the last number [dB].
 _CORRELATED_BINS, _SURE_GAIN, _LEAST_DB = 10.0, 20.0, 2.5
 
 
@@ -411,7 +415,7 @@ def _together_db(shown: Sequence[_Models]) -> float:
             columns += [] if trial.change_db is None else [trial.change_db]
             columns += [] if trial.columns is None else list(trial.columns.T)
         design, target = np.column_stack(columns), e.measured_db - e.predicted_db
-        # omit infinite levels, for a position at the UAV itself
+        # omit infinite levels: a candidate position of the tower may be that of the UAV
         design = design[:, np.isfinite(design).all(axis=0)]
         residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
         squares.append((residual**2).sum() / max(len(target) - design.shape[1], 1))
@@ -435,16 +439,17 @@ def _names(model: _Model) -> frozenset[str]:
 
 
 def _best(table: _Models, faults: Set[str]) -> _Model:
-    """Return the best model of a channel that has no other faults than the given ones."""
+    """Return the best model of a channel that contains no other faults than ``faults``."""
     return max((model for names, model in table.items() if names <= faults), key=lambda model: model.gain)
 
 
-# Number of faults per channel that are combined in pairs, and number of faults whose residual is searched for others.
+# Number of faults per channel that are combined in pairs, and number of faults whose residual is searched for a second
+# fault.
 _MOST_TRIED, _MOST_FIRST = 6, 2
 
 
 def _models(e: LevelEvidence) -> _Models:
-    """Return the likeliest model of each fault and of pairs of the best ones."""
+    """Return the likeliest model of each fault, and of pairs of the best faults."""
     sound = _fitted(e)
 
     def model(*trials: Trial, at: NoiseParameters = sound.parameters, search: bool = True) -> _Model:
@@ -456,7 +461,8 @@ def _models(e: LevelEvidence) -> _Models:
     def best_of(sets: Iterable[tuple[Trial, ...]], at: NoiseParameters) -> list[_Model]:
         """Return the likeliest model of each set of names, best first, with its own noise.
 
-        Unnamed levels and unnamed gains are separate, because their order can change with other noise.
+        Trials without a name that change levels are kept apart from those that add a gain, because their order can
+        change with other noise.
         """
         best: dict[tuple[frozenset[str], bool], _Model] = {}
         for trials in sets:
@@ -472,7 +478,7 @@ def _models(e: LevelEvidence) -> _Models:
     models, likely = [model(search=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
     models += [model(first.trials[0], second.trials[0], at=first.parameters) for first, second in pairs]
-    # if half or twice the decibels is a candidate, leave out unnamed slopes, which would explain the same error
+    # if half or twice the decibels is a candidate, skip slopes without a name, which would explain the same error
     named = any(m.gain > 0.0 and _names(m) & {"decibels", "exponent or decibels", "sign"} for m in alone)
     for first in likely:
         rest = [trial for trial in _candidates(_without(e, first)) if trial.name or not named]
@@ -500,11 +506,11 @@ def _rmse_db(models: Sequence[_Model]) -> float:
 def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause:
     """Return the cause with the sentence of the channel that shows it best.
 
-    The data cannot distinguish the first name from the other ones.
+    The data cannot distinguish the causes in ``names``.
     """
     name = names[0]
     trial = shown[0][frozenset([name])].trials[0]
-    # omit channels with other numbers, such as those of another clock, because they contradict the sentence
+    # omit channels with other numbers, for example from another clock, because the sentence would be wrong for them
     shown = [table for table in shown if table[frozenset([name])].trials[0].sentence == trial.sentence]
     alone = [table[frozenset([name])] for table in shown]
     rmse, rmse_with = _rmse_db([table[_SOUND] for table in shown]), _rmse_db(alone)
@@ -520,7 +526,7 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
 
 
 def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, search: bool = True) -> NoiseFit:
-    """Fit offset and coefficients of some faults, with the given noise or with the likeliest one near it."""
+    """Fit offset and coefficients of some faults, with the given noise or with the likeliest noise near it."""
     target = e.measured_db - e.predicted_db
     clipped = np.zeros(len(target), dtype=np.bool_)
     shown = np.ones(len(target))
@@ -560,7 +566,7 @@ _OFFSET_DB = 100.0
 
 
 def _clock(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the tested lag of the radio clock, or the likeliest lag as an alternative without a name."""
+    """Yield the lag that the clock test found, or the likeliest lag as an alternative without a name."""
     if e.clock is not None and e.clock.shifted:
         lag = e.clock.radio_minus_telemetry_s
         change_db = np.interp(e.time_s - lag, e.time_s, e.predicted_db) - e.predicted_db
@@ -568,7 +574,7 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         estimate = lag, *e.clock.ci95_s
         yield Trial(name="clock", sentence=sentence, next_step=step, change_db=change_db, estimate=estimate)
     yield from _drifting(e)
-    # also try levels of another time or in reverse order, so that they are not attributed to other causes
+    # also try levels of another time or in reverse order: otherwise another cause would be named for them
     since, length = e.time_s - e.time_s[0], max(float(np.ptp(e.time_s)), 1e-9)
     backwards = np.interp(length - since, since, e.predicted_db)
     channels = 1 + len(e.others)  # all channels share the telemetry, so they share the cost
@@ -600,7 +606,7 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
         return
     best, cost = _likeliest(e, levels, possible=nearer)
     rate = pairs[best][0]
-    # a rate at the end of the search gets no name: the best rate may be larger, and no clock is that wrong
+    # do not name a rate at the end of the search range: the true rate may be larger, and no clock is that wrong
     yield Trial(
         name="clock" if abs(rate) < max(_RATES) else _UNNAMED,
         cost=_RARE + cost, change_db=levels[best] - e.predicted_db,
@@ -610,7 +616,7 @@ def _drifting(e: LevelEvidence) -> Iterator[Trial]:
     )  # fmt: skip
 
 
-# Relative rates of a clock, least and largest error that they lead to [s], and where in the flight the clock is right.
+# Relative rates of a clock, smallest and largest resulting error [s], and where in the flight the clock is right.
 _RATES = np.outer([0.0025, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05], [-1, 1]).ravel().tolist()
 _LEAST_DRIFT_S, _MOST_DRIFT_S, _RIGHT_AT = 3.0, 60.0, (0.0, 0.25, 0.5)
 
@@ -618,7 +624,7 @@ _LEAST_DRIFT_S, _MOST_DRIFT_S, _RIGHT_AT = 3.0, 60.0, (0.0, 0.25, 0.5)
 def _likeliest(
     e: LevelEvidence, levels_db: FloatArray, *, weight: AnyArray | float = 1.0, possible: BoolArray | bool = True
 ) -> tuple[int, float]:
-    """Return the index of the likeliest of levels (m, n) under noise of a usual correlation, and the search's cost.
+    """Return the index of the likeliest row of levels (m, n) under typically correlated noise, and the search cost.
 
     The prior probability of each level is proportional to ``weight``. Levels that are not ``possible`` are not chosen.
     """
@@ -640,7 +646,7 @@ _LAGS_S = np.arange(-60.0, 61.0, _LAG_STEP_S)
 
 
 def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: NoiseParameters = START) -> Trial:
-    """Return the trial with the likeliest of some values, and the range of values that are nearly as likely."""
+    """Return the trial with the likeliest value, and the range of values that are nearly as likely."""
     tried = sorted(trials)
     likelihood = _log_likelihoods(e, [trials[value] for value in tried], at)
     width = np.gradient(tried) if len(tried) > 1 else np.ones(1)
@@ -661,12 +667,12 @@ def _log_likelihoods(e: LevelEvidence, trials: Sequence[Trial], at: NoiseParamet
 
 
 def _concentration(log_likelihood: FloatArray, width: FloatArray) -> float:
-    """Return the log of the greatest likelihood over its mean, which is weighted by the width of each value."""
+    """Return the log of the ratio of the greatest to the mean likelihood. Each value is weighted by its width."""
     top = log_likelihood.max()
     return -math.log(float(np.exp(log_likelihood - top) @ width / width.sum()))
 
 
-# Values between two neighbouring ones, as a share of their distance.
+# Interpolated values around a given value, as a share of the distance to its neighbour.
 _BETWEEN = np.linspace(-0.8, 0.8, 9)
 
 
@@ -674,7 +680,7 @@ def _tuned(
     e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Trial, words: Callable[[float], str]
 ) -> Trial:
     """Return the trial with the likeliest value. Changes at values between the given ones are interpolated."""
-    # the value 0 changes nothing, and the interpolation goes through it
+    # the value 0 means no change, which is an exact point of the interpolation
     values = sorted({0.0, *changes_db})
     likely = _profiled(e, {value: dataclasses.replace(trial, change_db=change) for value, change in changes_db.items()})
     table = np.stack([changes_db.get(value, np.zeros(len(e.time_s))) for value in values])
@@ -688,7 +694,7 @@ def _tuned(
 
 
 def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the weights (m, n) of n knots for a cubic spline at m places.
+    """Return the weights (m, n) of n knots for a cubic spline at m positions.
 
     Loading scipy.interpolate would take 0.1 s.
     """
@@ -699,9 +705,9 @@ def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
 
 
 def _heading(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield an antenna turned about the vertical."""
+    """Yield a UAV antenna that is rotated about the vertical axis."""
     if e.turned_db:
-        # if the logged attitude is not used, the heading cannot be wrong
+        # the heading is less likely to be wrong if the logged attitude is not used
         cost, step = _RARE if "logged" in e.attitude_db else 0.0, "check the antenna's mount and the logged yaw"
         words = "the UAV antenna is turned clockwise by {:.0f} degrees".format
         yield _tuned(e, e.turned_db, Trial(name="heading", cost=cost, next_step=step), words)
@@ -718,7 +724,7 @@ def _attitude(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _height(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield heights of another datum, and heights that drift."""
+    """Yield a constant and a growing error of the logged height."""
 
     def words(rise: float) -> str:
         return f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says"
@@ -751,7 +757,7 @@ def _growing(e: LevelEvidence) -> FloatArray:
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:
     """Yield telemetry with other units, signs or columns than its reader assumes."""
-    # no factor corrects heights that jump
+    # a factor cannot explain heights that jump
     jumps = (np.abs(np.diff(e.place_m[:, 2])) > _JUMP_M + _FASTEST_MPS * np.diff(e.time_s)).any()
     step = "check the telemetry's columns and units"
     for meaning, change in {**e.misread_db, **({} if jumps else e.scaled_db)}.items():
@@ -772,7 +778,7 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _place(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the likeliest place of the tower near the one in the files, or an opposite displacement of the track."""
+    """Yield the likeliest position of the tower near that in the site file, or the opposite shift of the track."""
     if not e.displaced_db:
         return
     radii = np.array(sorted({radius for radius, _ in e.displaced_db}))
@@ -798,13 +804,13 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     yield Trial(name="place", cost=cost, change_db=changes[best], estimate=estimate, sentence=sentence, next_step=step)
 
 
-# Places further away than this become unlikely [m], and steps between the computed places.
+# Distance [m] beyond which positions become unlikely, and steps between the computed positions.
 _NEAR_PLACE_M, _FINER, _AROUND = 50.0, (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75), np.arange(-4, 5)
 _SIDES = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
 def _channels(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the log of the other channel of the tower."""
+    """Yield swapped logs of two channels of the tower."""
     if len(e.others) != 1 or e.others[0].unit != e.unit:
         return
     change_db = np.interp(e.time_s, _seconds(e.others[0], e), e.others[0].predicted_db) - e.predicted_db
@@ -815,7 +821,7 @@ def _channels(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _seconds(other: LevelEvidence, e: LevelEvidence) -> FloatArray:
-    """Return the times (n,) of another channel since the start of a channel."""
+    """Return the times (n,) of another channel, counted from the start of ``e``."""
     return np.asarray(other.time_s + (other.start - e.start) / np.timedelta64(1, "s"))
 
 
@@ -823,7 +829,7 @@ CATCH_ALL = "pattern"
 
 # Causes that depend on the direction alone, and therefore imitate errors of the propagation model.
 OF_DIRECTION = frozenset({"blocked", CATCH_ALL})
-# Causes that a step replaces if held-out flights do not have such a step.
+# Causes that a step replaces if held-out flights do not have a step like it.
 _OF_HEALTH = OF_DIRECTION | {"gain step"}
 
 _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT`"
@@ -840,7 +846,7 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
     columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
-    if e.turned_db:  # this column can remove the known pattern: it adds the mean of the level over all headings
+    if e.turned_db:  # this column adds the mean of the level over all headings, so it can cancel the known pattern
         columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
     sentence, step = _PATTERN[e.antenna]
     yield Trial(name=CATCH_ALL, sentence=sentence, next_step=step, columns=np.column_stack(columns))
@@ -860,10 +866,10 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield levels with half or twice the decibels, as if an amplitude were a power or the reverse, or with minus them.
+    """Yield levels with half or twice the decibels (an amplitude was read as a power, or vice versa), or minus them.
 
     The interval of the slope must support the factor, and a path-loss exponent and a gain over elevation, which change
-    levels in the same way, must be much less likely.
+    levels in the same way, must be much less likely than the factor.
     """
     up = np.sin(np.radians(e.uav_elevation_deg))
     elevation = _GAIN_DB * np.column_stack([up, up**2, up**3])
@@ -893,7 +899,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
             continue
         fit = _fitted(e, trial)
         slope, *apart = (_fitted(e, other, at=fit.parameters).log_likelihood for other in others)
-        # levels that remain above a floor change by fewer decibels than the link
+        # above a floor, logged levels change by fewer decibels than the link
         least = -math.inf if e.floored else max(apart) + _RARE
         if _is_slope(e, factor, fit.parameters) and fit.log_likelihood > max(least, slope):
             yield trial
@@ -902,7 +908,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     yield from (others[0], *others[2:])
 
 
-# Cause, sentence and next step by slope of measured over predicted levels, and the prior standard deviation of a slope.
+# Cause, sentence and next step for each slope of measured over predicted levels. Prior standard deviation of a slope.
 _POWERS = "check: 10 log10 of power, 20 log10 of amplitude"
 _FACTORS = {
     -1.0: ("sign", "the values rise where the predicted level falls, as path losses do", "negate them in the log"),
@@ -910,11 +916,11 @@ _FACTORS = {
     2.0: ("decibels", "the levels change by twice the predicted decibels", _POWERS),
 }
 _SLOPE = 0.5
-# Least slope that an exponent explains, because heights and antennas change the slope by less, and largest height of a
-# receiver among obstacles [m].
+# Smallest slope that is attributed to a path-loss exponent: heights and antennas change the slope by less. Largest
+# height of a receiver among obstacles [m].
 _STEEP, _NEAR_GROUND_M = 1.25, 10.0
-# Largest relative difference of a slope from these factors, for any antennas and for learned ones. The slope of learned
-# antennas is 0.95 to 1.09 on held-out flights of dataset 12, and 0.9 on the LTE flight at 50 m.
+# Largest relative difference of a slope from these factors, for any antennas and for learned antennas. The slope of
+# learned antennas is 0.95 to 1.09 on held-out flights of dataset 12, and 0.9 on the LTE flight at 50 m.
 _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {-1.0: 0.25, 0.5: 0.1, 2.0: 0.05}, {-1.0: 0.25, 0.5: 0.12, 2.0: 0.1}
 
 
@@ -939,9 +945,9 @@ def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) ->
 
 
 def _controlled(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a gain control, which follows the mean level over some time, as an alternative without a name."""
+    """Yield a gain control, which follows the mean level over some time. It is an alternative without a name."""
     for slow in slow_levels(e.time_s, e.predicted_db):
-        # a gain control can only weaken changes of the level; another slope explains stronger changes
+        # a gain control can only weaken changes of the level; stronger changes are explained by another slope
         if (e.measured_db - e.predicted_db) @ (slow - slow.mean()) < 0.0:
             yield Trial(cost=math.log(len(_CONTROLS_S)), columns=_SLOPE * (slow - slow.mean())[:, None])
 
@@ -961,8 +967,8 @@ _CONTROLS_S = (10.0, 20.0, 40.0)
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the noise that the receiver writes without lock, by the quality in the log."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
-        # the report counts these samples in a caution, and its first sentence already has the error with the floor; the
-        # log itself shows this fault, so it does not pay for being rare
+        # the report has a caution with the number of these samples, and its first sentence already states the error
+        # with the floor. The log itself shows this fault, so there is no penalty for being rare.
         sentence = "the receiver had no lock in parts of the flight"
         yield Trial(name="lock", cost=-_SELDOM, clipped=lost, sentence=sentence)
 
@@ -971,7 +977,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
     """Yield samples without detection, which have the same least level."""
     if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
-        # if the levels vary, they are noise: means over seconds vary less, so a margin above the median is enough
+        # levels that vary are noise. Their means over seconds vary less, so a margin above the median is enough.
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         sentence = f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: not detected"
         step = f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in this `logs:` line"
@@ -994,13 +1000,13 @@ def _limits(e: LevelEvidence) -> Iterator[Trial]:
         yield from _clipping(e, -1.0)
 
 
-# A limit allows a small share of samples beyond it, and the prediction must exceed it in a larger share [dB].
+# A small share of samples may be beyond a limit by more than the first number [dB].
 _BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
 _FAR_DB, _LEAST_FAR = 3.0, 0.1
 
 
 def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
-    """Yield hard and soft limits below (``side`` 1) or above (-1) which a receiver shows no level."""
+    """Yield hard and soft limits of the level: a floor (``side`` 1) or a ceiling (``side`` -1)."""
     pile = _pile(e, side)
     if pile is not None:
         limit = float(e.measured_db[pile].mean())
@@ -1012,12 +1018,12 @@ def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
         yield _profiled(e, trials)
 
 
-# Least share of the samples at a limit.
+# Smallest share of the samples at a limit.
 _LEAST_CLIPPED = 0.06
 
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
-    """Return the samples at the receiver's limit, or None if the samples at the end of the levels fade like others."""
+    """Return the samples at the receiver's limit, or None if the samples with extreme levels fade like all others."""
     if e.step_db > PILE_DB:  # coarse rounding collects many samples at each level, not only at a limit
         return None
     end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
@@ -1026,7 +1032,7 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
     if inside.sum() < max(LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < LEAST_BINS:
         return None
-    # at a limit of the receiver, the predicted level is beyond the limit; under constant interference it is not
+    # at a limit of the receiver, predicted levels are beyond the limit; with constant interference they are not
     error = e.measured_db - e.predicted_db
     missing = side * float(np.median(error[pile]) - np.median(error[~pile]))
     limited = np.median(step[inside]) < MOST_FADING * np.median(step[outside]) and missing > -_BEYOND_DB
@@ -1034,7 +1040,7 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
 
 
 def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
-    """Return the cause for a limit of the levels, or None if measured levels beyond it show that nothing is clipped."""
+    """Return the cause for a limit of the levels, or None if measured levels beyond it show that there is no limit."""
     if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
         return None
     name, words, step = _LIMITS[side]
@@ -1047,7 +1053,7 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     """Return a soft limit: the power of a floor is added, or the level approaches a ceiling."""
     if (trial := _limited(e, limit, side)) is None:
         return None
-    # the median does not depend on the samples at the limit
+    # start from the median, which the samples at the limit hardly affect
     offset = float(np.median(e.measured_db - e.predicted_db))
     for _ in range(5):
         level = e.predicted_db + offset
@@ -1096,7 +1102,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
         if not possible.any():
             continue
         gain = np.where(possible, gain, -np.inf)
-        # a sector without samples is as unlikely as one without loss
+        # count sectors without samples like sectors without a loss
         cost = _concentration(gain, np.ones(len(gain))) + math.log(len(seen) / len(gain))
         middle, width = coarse[int(np.argmax(gain))]
         around = [(middle + i, max(width + j, 2.0)) for i in range(-6, 7) for j in range(-8, 9)]
@@ -1112,7 +1118,7 @@ def _blocked(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatArray:
-    """Return the share (m, n) of the loss of each sector (middle and width [deg]) that each sample has."""
+    """Return the share (m, n) of the loss in each sector (middle and width [deg]) that applies to each sample."""
     middle, width = (np.array(column)[:, None] for column in zip(*sectors, strict=True))
     middles, of = np.unique(middle, return_inverse=True)  # sectors of several widths have the same middle
     off = np.abs(wrap_degrees(e.tower_azimuth_deg - middles[:, None]))[of.ravel()]
@@ -1128,7 +1134,7 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     starts = np.arange(LEAST_BINS * 2, n - LEAST_BINS * 2)
     if not len(starts):
         return
-    # neighbouring bins show the same step
+    # limit the number of tried starts, because neighbouring bins have nearly the same step
     starts = starts[:: 1 + len(starts) // _MOSTSTARTS]
     # a gain that drifts is an alternative to a step
     creep = _STEP_DB * (np.arange(n) / n)[:, None]

@@ -21,8 +21,8 @@ _NEAR_M, _NEAR_DEG = 1.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 FEWEST_SAMPLES = 100
 EPOCH = np.datetime64(0, "s")
-# Samples at a limit: largest distance from the extreme level [dB], smallest share and number of the samples, and their
-# largest fading as a share.
+# Samples at a limit: largest distance from the extreme level [dB], smallest share and number of samples, and largest
+# ratio of their fading to that of other samples.
 PILE_DB, _LEAST_PILE, LEAST_BINS, MOST_FADING = 1.2, 0.1, 5, 0.35
 
 
@@ -73,13 +73,14 @@ class LevelEvidence:
     transmit_power_dbm : float
         Transmit power of the predicted level.
     distance_db : (n,), optional
-        Part (n,) of the predicted level that depends only on the distance.
+        Part of the predicted level that depends only on the distance.
     displaced_db : mapping of (float, float) to (n,)
-        Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg].
+        Change of the predicted level if the tower is moved, by distance [m] and azimuth [deg] of the move.
     least : (n,) bool, optional
-        Mask (n,) of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent.
+        Mask of samples at the lowest level of the log (exactly, or within its noise), if that level is frequent.
     others : tuple of LevelEvidence
-        The other channels of the tower, which step at the same time if a cable or a gain changes, or can be swapped.
+        The other channels of the tower. Their levels step at the same time if a cable or a gain changes, and their logs
+        may be swapped.
     step_db : float
         Smallest difference between two levels of the log: its rounding.
     """
@@ -150,7 +151,7 @@ def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
     at = level == level.min()
     # rounded levels all occur often: the lowest one is a floor only if it occurs at least as often as the next one
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
-    # levels that the log repeats are one reading
+    # count a run of equal levels as one measurement, because the log repeats levels
     usual_run = 1.0 + 2.0 * np.median(ages(np.arange(len(level)), level)[~at]) if not at.all() else 1.0
     often = at.sum() >= max(_AT_END * usual_run, _SHARE_AT_END * len(level), next_often)
     changed["step_db"] = float(np.diff(np.unique(level)).min(initial=np.inf))
@@ -165,7 +166,7 @@ def ages(time_s: AnyArray, level_db: FloatArray) -> FloatArray:
 
 
 def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
-    """Return means of values (n,) or (n, k) over the ``count`` samples of each place."""
+    """Return means of values (n,) or (n, k) over groups, given the group of each value and the group sizes."""
     if values.ndim > 1:
         return np.column_stack([_mean(column, place, count) for column in values.T])
     return np.asarray(np.bincount(place, values) / count)
@@ -177,7 +178,7 @@ def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray
     flat = np.cos(elevation)
     towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
     count = np.bincount(second)
-    # lists, because a distance of two short lists is faster than that of two arrays
+    # use lists: math.dist is faster for short lists than for arrays
     at, towards = _mean(e.place_m[finite], second, count).tolist(), _mean(towards, second, count).tolist()
     number, begin = np.zeros(len(at), dtype=np.int64), 0
     for i in range(1, len(at)):
@@ -210,6 +211,6 @@ def _undetected(level_db: FloatArray) -> BoolArray | None:
     return under if at_once and np.median(step[inside]) < MOST_FADING * fading_db else None
 
 
-# A loss of detection exceeds the usual step of fading by this factor. For a receiver with a noisy lowest level, the
-# ratio is 9, for others 3.
+# Smallest ratio of the steps into the densest level to the steps of fading, if these are losses of detection. The ratio
+# is 9 for a receiver with a noisy lowest level, and 3 for other receivers.
 _LOST = 5.0

@@ -9,9 +9,9 @@ exp(-chord^2 / 2 turn^2)``. Each flight has its own ``offset``, and its own ``dr
 drift_s)``. The lengths have physical bounds (:data:`BOUNDS`), because an unbounded fit would mistake fading for a field
 over positions. Channels are fitted separately.
 
-:class:`FlownFlights` computes the standard deviation after a planned flight. For that, a Gaussian process needs only
-the directions and positions of the route, not the levels. The antennas are modelled by :mod:`.gains`, and their
-residual by a field.
+:class:`FlownFlights` computes the standard deviation after a planned flight. The standard deviation of a Gaussian
+process depends only on the directions and positions of the route, not on the levels. The antennas are modelled by
+:mod:`.gains`, and what they do not explain by a field.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ _MOST_ROWS = 3000
 # Largest number of rows per channel from which scales are fitted.
 FIT_ROWS = 700
 
-# Number of targets per block, which limits the memory.
+# Number of targets per block. It limits the memory that is used.
 AT_ONCE = 1024
 
-# Code of a new flight, which has no rows.
+# Code of a flight without rows.
 NEW_FLIGHT = -1
 
 
@@ -59,7 +59,7 @@ class FieldModel:
         The field over positions: its standard deviation, horizontal and vertical length [m], and chord of the
         direction. With an infinite ``turn`` the field does not depend on direction.
     offset_sd_db : float
-        Standard deviation of the offset between flights, as from :func:`_offset_sd_of` if it is fitted.
+        Standard deviation of the offset between flights. If fitted, it is estimated by :func:`_offset_sd_of`.
     drift_sd_db, drift_s : float
         Standard deviation and correlation time [s] of the drift within a flight.
     noise_sd_db : float
@@ -210,7 +210,7 @@ def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
 
 @dataclass(frozen=True)
 class FieldFit:
-    """The process conditioned on rows. Standard deviations do not depend on the values ``value_db`` (n,)."""
+    """The process conditioned on rows. The standard deviations do not depend on the values ``value_db`` (n,)."""
 
     model: FieldModel
     rows: Rows
@@ -249,7 +249,7 @@ class FieldFit:
 
     @cached_property
     def _whitened(self) -> tuple[Rows, Factor, FloatArray]:
-        """The rows that are used, the factor of their covariance, and their values whitened by it."""
+        """The rows that are used, the Cholesky factor of their covariance, and the whitened values of the rows."""
         used = spread_out(len(self.rows), _MOST_ROWS)
         rows = self.rows.part(used)
         factor = Factor.of(_noisy(self.model, covariance(self.model, rows, rows)))
@@ -273,7 +273,7 @@ def fit_field(
     Parameters
     ----------
     channels : sequence of (Rows, (n,))
-        Rows and residuals [dB] of each channel. They share the model, not the field.
+        Rows and residuals [dB] of each channel. All channels have the same model, but separate fields.
     start : FieldModel, optional
         Start of the search, and the values that are not fitted. The offset between flights is estimated by
         :func:`_offset_sd_of`.
@@ -323,7 +323,7 @@ def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
     """Return at most :data:`FIT_ROWS` rows as uninterrupted segments, because thinning would hide short scales."""
     if len(rows) <= FIT_ROWS:
         return rows, value
-    # seven segments over the flight cover near and far, climb and landing
+    # use seven segments, which contain near and far positions, climb and landing
     stretch = FIT_ROWS // 7
     starts = np.linspace(0, len(rows) - stretch, 7).astype(int)
     keep = np.unique(np.concatenate([np.arange(s, s + stretch) for s in starts]))

@@ -20,7 +20,7 @@ The error model of a level with learned antennas consists of gain, nuisance of t
 The levels of a flight show whether antennas learned on other flights apply to it. The levels must be more
 likely with the learned gain than with an unknown gain under the prior of a calibration. They must also be more likely
 than with the learned gain of the UAV rotated by 90, 180 or 270 deg. Offset, nuisance, noise and all other gains are the
-same in each case. Names of readers, files and channels have no effect.
+same in each case. The names of readers, files and channels do not matter.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ _OFFSET_SD = 100.0
 # Largest number of means in a fit (a matrix of 72 MB). Many flights are averaged over longer times to stay below it.
 MOST_ROWS = 3000
 
-# Candidate strengths of the tower's gains relative to the UAV's. The likelihood selects one. No other parameter is
-# selected: selecting length and strength of the nuisance raised the error on dataset 12 by 0.06 dB.
+# Candidate strengths of the tower's gains relative to the UAV's. The likelihood selects a factor. No other parameter is
+# selected this way: selecting length and strength of the nuisance raised the error on dataset 12 by 0.06 dB.
 _TOWER_FACTORS = (1.0, 0.5)
 
 
@@ -132,7 +132,7 @@ class LinkSamples:
         return dataclasses.replace(self, floor_db=floor_db, **arrays)
 
     def binned(self, width_s: float) -> LinkSamples:
-        """Return means over bins of time, with normalised directions.
+        """Return means over time bins. The mean directions are normalised.
 
         Within a few seconds, the direction changes by less than the correlation lengths of the gains.
         """
@@ -167,7 +167,7 @@ class Term:
     frame : {"body", "mast", "pair"}
         Argument of the process: direction of the tower in the body frame, of the UAV at the mast, or both.
     per : {"all", "antenna"}
-        One gain for all, or one per tower and channel.
+        One gain for all antennas of the towers, or one per antenna (tower and channel).
     length : float
         Length of the kernel, as a chord on the unit sphere.
     sd_db : float
@@ -210,9 +210,9 @@ class GainModel:
     bin_s : float
         Duration over which samples are averaged [s].
     own_scales_db : tuple of (str, float, float)
-        ``own_sd_db`` and ``noise_sd_db`` of campaigns and of antennas (``tower.channel``) that have their own, after
-        the name of the campaign or antenna. A fit uses those of campaigns. The error of a level uses those of its
-        antenna, if it has enough levels: the shadowing differs between ports of a tower.
+        Name of a campaign or antenna (``tower.channel``), with its separate ``own_sd_db`` and ``noise_sd_db``. A fit
+        uses the values of campaigns. The error of a level uses the values of its antenna if there are enough levels,
+        because shadowing differs between the ports of a tower.
     """
 
     terms: tuple[Term, ...] = ANTENNA_TERMS
@@ -255,7 +255,7 @@ def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
     if term.frame == "pair":
         kernel = gaussian_kernel(at, to, term.length)
-    else:  # in place, because these matrices take most of the time of a calibration
+    else:  # in place, because a calibration spends most of its time on these matrices
         kernel = np.asarray(cdist(at, to))
         kernel /= -term.length
         np.exp(kernel, out=kernel)
@@ -265,7 +265,7 @@ def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=len(ANTENNA_TERMS))
 def _last_kernel(term: Term, at: bytes, to: bytes) -> FloatArray:
-    """Return :func:`term_kernel` of float64 arrays given as bytes. Cached: channels of a log share directions."""
+    """Return :func:`term_kernel` of float64 arrays given as bytes. Cached: channels of a log have equal directions."""
     width = 6 if term.frame == "pair" else 3
     return term_kernel(term, np.frombuffer(at).reshape(-1, width), np.frombuffer(to).reshape(-1, width))
 
@@ -348,11 +348,11 @@ class GainFit:
     Parameters
     ----------
     model : GainModel
-        Model with the standard deviations and bin duration that were used.
+        Model with the standard deviations and the bin duration that the fit used.
     rows : tuple of LinkSamples
-        Means over bins, the training data.
+        The training data: means over bins.
     log_evidence : float
-        Log marginal likelihood, up to a constant of the data.
+        Log marginal likelihood, up to a constant that depends only on the data.
     """
 
     model: GainModel
@@ -435,7 +435,7 @@ class GainFit:
         return dataclasses.replace(samples, campaign=first.campaign, airframe=first.airframe)
 
     def _rows_of(self, antenna: str) -> list[LinkSamples]:
-        """Return the fitted links with an antenna."""
+        """Return the training rows of an antenna."""
         rows = [s for s in self.rows if s.antenna == antenna]
         if not rows:
             raise UsageError(
@@ -463,17 +463,17 @@ class GainFit:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the moments of a sum of terms along ``at`` (n,), relative to its mean over ``about``.
 
-        They are the mean (n,), the whitened covariance (rows, n) with the levels, and the part (n,) of the prior
+        The moments are the mean (n,), the whitened covariance (rows, n) with the levels, and the part (n,) of the prior
         covariance that comes from the mean over ``about``.
         """
-        # ``at`` and ``about`` have one antenna, so all terms are correlated
+        # ``at`` and ``about`` have the same antenna, so every term is correlated between them
         centre = gain_covariance(terms, about, [at, *self.rows]).mean(axis=0)
         across = gain_covariance(terms, [at], self.rows) - centre[len(at) :]
         mean_part = 0.5 * gain_covariance(terms, about, about).mean() - centre[: len(at)]
         return across @ self._weights, self._factor.whiten(across.T), mean_part
 
 
-# Number of samples that are predicted together, which limits the memory.
+# Number of samples that are predicted together. It limits the memory that is used.
 AT_ONCE = 2000
 
 
@@ -541,7 +541,7 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
     factor = Factor.of(covariance)
     target = np.concatenate([_centred(s) for s in rows])
     weights = factor.solve(target)
-    # the part of the levels that the gains explain
+    # multiply by the covariance of the gains to get the part of the levels that they explain
     parts = np.split(weights, np.cumsum([len(s) for s in rows])[:-1])
     gain = target - np.concatenate([own_covariance(model, s) @ w for s, w in zip(rows, parts, strict=True)])
     if scaled:
@@ -590,7 +590,7 @@ def _with_scales(model: GainModel, rows: Sequence[LinkSamples]) -> GainModel:
     names = list(dict.fromkeys(s.campaign for s in rows))
     if len(names) == 1 or model.own_scales_db:
         return model
-    # every second mean is enough to find the scales, and the Cholesky factor then takes an eighth of the time
+    # every second mean is enough to select the scales, and reduces the time of the Cholesky factorisation to an eighth
     some = [s.part(np.arange(0, len(s), 2)) for s in rows]
     every = dict.fromkeys([*names, *(s.antenna for s in some)])
     parts = {name: [s for s in some if name in (s.campaign, s.antenna)] for name in every}
@@ -615,7 +615,7 @@ def _likeliest(
 def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
     """Return the model with its bin duration, and the means over bins of each series.
 
-    Raise InputError if there are no means.
+    Raise InputError if there are no valid samples.
     """
     binned = [s.binned(model.bin_s) for s in series]
     longer = math.ceil(sum(map(len, binned)) / MOST_ROWS)
@@ -630,13 +630,13 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
     return model, sorted(binned, key=lambda s: groups.index(s.group))
 
 
-# Step between candidate azimuths.
+# Step between candidate azimuths [deg].
 STEP_DEG = 10.0
 
-# Standard deviation of a bin about the patterns: a residual of 4 dB that is correlated over about six bins. Least
-# squares are used, because a covariance with learned gains or with shadowing over position would absorb the broad shape
-# over azimuth that determines a mount. With such a covariance, the azimuth at the UAV jumps between flights of dataset
-# 12 (320 and 120 deg instead of 270 and 270).
+# Standard deviation of a bin about the patterns [dB]. It allows for a residual of 4 dB that is correlated over about
+# six bins. Least squares are used, because a covariance with learned gains or with shadowing over position would absorb
+# the broad shape over azimuth that determines a mount. With such a covariance, the azimuth at the UAV jumps between
+# flights of dataset 12 (320 and 120 deg instead of 270 and 270).
 _MOUNT_NOISE_DB = 10.0
 
 # Duration over which samples are averaged [s].
@@ -748,8 +748,8 @@ SHARES = (0.5, 0.9, 0.95)
 BAND = 0.9
 
 
-# Usual SD of the offset between flights [dB]. It is a guess, because it cannot be learned: estimates from any three of
-# dataset 12, LTE, AFAR and NR range from 1.0 dB (without AFAR) to 2.8 dB (without dataset 12).
+# Usual SD of the offset between flights [dB]. This is a guess, because the data do not determine it: estimates from any
+# three of dataset 12, LTE, AFAR and NR range from 1.0 dB (without AFAR) to 2.8 dB (without dataset 12).
 USUAL_OFFSET_DB = 1.5
 
 
@@ -758,8 +758,8 @@ def offset_sd_db(squares_db2: float, count: int, usual_db: float = USUAL_OFFSET_
 
     ``squares_db2`` is the sum of squared differences of the offsets of flights from their mean, with ``count`` degrees
     of freedom. The SD between flights is integrated over its posterior distribution, because few flights hardly
-    determine it. The prior is log normal with the median ``usual_db`` and a factor of three. It does not exclude equal
-    offsets, which flights with the same devices can have.
+    determine it. The prior is log normal with the median ``usual_db`` and a factor of three. It allows almost equal
+    offsets, which occur in flights with the same devices.
     """
     from scipy.special import ndtr, ndtri
 
@@ -827,7 +827,7 @@ class Spread:
         return np.asarray(total * (z + third * k / 24.0 + fifth * skew2 / 72.0))
 
 
-# Error model of learned files that contain only the standard deviation of the gain.
+# Error model for a learned file that contains only the standard deviation of the gain.
 NO_SPREAD = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
 
 
@@ -887,7 +887,7 @@ class LostLock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatedSpread:
-    """The stated error of one series: standard deviation of the gain (n,) [dB] (NaN without a pose), and other parts.
+    """The stated error of one series: SD of the gain (n,) [dB] (NaN without a pose), and the other parts of the error.
 
     ``lock`` replaces the error model for a receiver that loses its lock.
     """
@@ -980,7 +980,7 @@ def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float
         size = np.bincount(member)
         deviation = level - (np.bincount(member, weights=level) / size)[member]
         several = size[member] > 1
-        # a deviation from the mean of n samples is too small by (n - 1) / n
+        # the expected squared deviation from a mean of n samples is too small by (n - 1) / n
         deviation = deviation[several] * np.sqrt(size[member] / np.maximum(size[member] - 1.0, 1.0))[several]
         squares, fourth = squares + float((deviation**2).sum()), fourth + float((deviation**4).sum())
         count += len(deviation)
@@ -992,14 +992,14 @@ def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float
 
 BODY, MAST, PAIR = ANTENNA_TERMS
 
-# Log odds that a learned gain needs against an unknown gain, and an airframe against each rotated copy. On field
+# Smallest log odds of a learned gain against an unknown gain, and of an airframe against each rotated copy. On field
 # flights, the limit of 3 accepts the airframe of dataset 12 for LTE and AADM (6.8 to 8.3) and always refuses that of NR
 # (-11.5 to -1.2).
 LEAST_ODDS = 3.0
 
 _TURNS_DEG = (90.0, 180.0, 270.0)
 
-# Log odds for an unknown gain that no prior from names can outweigh.
+# If the log odds for an unknown gain exceed this, the rotated copies are not computed.
 _HOPELESS = 8.0
 
 # Largest number of means, and shortest averaging time [s], with which a flight is tested.
@@ -1060,10 +1060,10 @@ class GainProcess:
 
         Notes
         -----
-        The process is the sum of ``A g`` and an independent rest. ``g`` is the gain at the directions G, with
+        The process is the sum of ``A g`` and an independent remainder. ``g`` is the gain at the directions G, with
         covariance S, and ``A = K(at, G) K(G, G)^-1`` with the prior K. The covariance of the first part is ``A S A'``,
-        that of the rest ``K - A K(G, at)``. The rest is scaled so that the diagonal of the sum is the variance of the
-        table.
+        that of the remainder is ``K - A K(G, at)``. The remainder is scaled so that the diagonal of the sum equals the
+        variance in the table.
         """
         across = term_kernel(self.term, at, self.directions)
         weights = self._factor.solve(across.T).T
@@ -1095,7 +1095,7 @@ class FlightEvidence:
         """Return the evidence for the learned antennas of both ends of one series, by its number.
 
         ``known`` returns the moments of the gain of both ends, without the part that its table of pairs does not
-        explain. The antennas must also be more likely than ``alternative`` (a log likelihood).
+        explain. The learned antennas must also be more likely than ``alternative`` (a log likelihood).
         """
         rows, noise = self.rows[number], self._noise[number]
         if not len(rows):

@@ -1,7 +1,7 @@
 """Health of a receiver: usual errors on held-out flights, and tests of a later flight for a changed level.
 
 Means of the error over 4 s consist of an offset, a correlated part and a white part. The sizes of both parts come from
-held-out flights. If they were fitted to a faulty flight, they would include its fault.
+held-out flights. Sizes that were fitted to a faulty flight would include its fault.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ BIN_S, _MOST_BINS = 4.0, 1000
 # Largest time and distance between two means from which the correlation is estimated.
 _LONGEST_S, _LONGEST_M = 100.0, 150.0
 # Prior standard deviations over flights: of the RMSE as a share of the RMSE, and of the difference of two channels
-# [dB]. Each counts as two flights. In one campaign, the RMSE of six held-out series varies by 8 %, and the difference
-# of channels by 0.3 dB.
+# [dB]. Each prior counts as two flights. In one campaign, the RMSE of six held-out series varies by 8 %, and the
+# difference of channels by 0.3 dB.
 _RMSE_SHARE, _DIFFERENCE_SD_DB = 0.08, 1.0
 _LEAST_SD_DB = 0.3
 
@@ -62,7 +62,7 @@ class HeldOut:
 
     @property
     def longest_run_s(self) -> float:
-        """Longest time without any change of the readings [s]."""
+        """Longest time over which the measured level did not change [s]."""
         known = np.isfinite(self.measured_db)
         return float(ages(self.time_s[known], self.measured_db[known]).max(initial=0.0))
 
@@ -115,7 +115,7 @@ def _sd(values: Sequence[float], prior: float) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """The noise in 4-s means: SD and correlation time of the correlated part, and SD of the white part."""
+    """The noise of means over 4 s: SD and correlation time of the correlated part, and SD of the white part."""
 
     slow_sd_db: float
     correlation_s: float
@@ -149,7 +149,7 @@ def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> 
 
 
 def _noise(series: Sequence[tuple[FloatArray, FloatArray]]) -> Noise:
-    """Return the noise of flights, each given by times and errors."""
+    """Return the noise of several flights, each given by its times and errors."""
     apart = [np.abs(time_s[:, None] - time_s[None]) for time_s, _ in series]
     errors = [error for _, error in series]
     variance, correlation_s = _decay(apart, errors, _LONGEST_S)
@@ -175,8 +175,8 @@ def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: f
 
 # --- a later flight -------------------------------------------------------------------------------------------------
 
-# Smallest chi-squared of a step on two channels, and addition per further channel. Healthy flights exceed it once in a
-# thousand. In simulated healthy flights of 830 s, 95 % are below 14 to 15, and 99 % below 17 to 20.
+# Smallest chi-squared of a step on two channels, and the amount added per further channel. Healthy flights exceed it
+# once in a thousand. In simulated healthy flights of 830 s, 95 % are below 14 to 15, and 99 % below 17 to 20.
 _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
 # Twice the log likelihood of a step must exceed that of a slower change, over these times [s] or over the flight, by
 # this.
@@ -208,7 +208,7 @@ class Judged:
 
     @property
     def health(self) -> LearnedHealth:
-        """Usual errors of the channel, which must be known for its antenna."""
+        """Usual errors of the channel. They must be known for its antenna."""
         assert self.learned.health is not None
         return self.learned.health
 
@@ -261,8 +261,8 @@ def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tupl
 def step_of(channels: Sequence[Judged]) -> Step | None:
     """Return the common step of all channels of a flight, or None if there is none.
 
-    A step must be larger than steps in healthy flights and likelier than a slower change, and the error after
-    subtracting it must be that of a healthy flight.
+    A step must be larger than steps in healthy flights and likelier than a slower change. After it is subtracted, the
+    error must be like that of a healthy flight.
     """
     series = [binned(c.time_s, c.error_db) for c in channels]
     least = _STEP_CHI2 + _FURTHER_CHI2 * max(len(channels) - 2, 0)
@@ -319,7 +319,8 @@ class OddLevel:
     difference_db: float
 
 
-# An offset or a difference of offsets is unusual if it exceeds both this number of standard deviations and of decibels.
+# An offset or a difference of offsets is unusual if it exceeds both this number of standard deviations and this level
+# [dB].
 _ODD_SD, _ODD_DB = 3.5, 4.0
 
 

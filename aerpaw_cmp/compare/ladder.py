@@ -19,7 +19,7 @@ from .statistics import FEWEST, Interval, PairedDifference, paired_difference, p
 # Number of areas of a flight. It is a power of two, because areas are halved.
 _BLOCKS = 8
 
-# A model is compared only if it has a level at this share of the samples.
+# A model is compared only if it has a level for at least this share of the samples.
 _LEAST_COVERED = 0.8
 
 
@@ -35,8 +35,8 @@ class CandidateModel:
     seconds : float
         Time to compute the levels of the flight [s].
     regressor_db : tuple of (n,), optional
-        For models without ray tracing: abscissa of a straight line, per series. Its slope is fitted together with the
-        offset, without the held-out area. If all values are 0, the model is a constant.
+        For models without ray tracing: abscissa of a straight line, per series. The slope of the line is fitted
+        together with the offset, without the held-out area. If all values are 0, the model is a constant.
     """
 
     model: str
@@ -57,7 +57,7 @@ class ModelRow:
     rmse_heldout_db : float
         RMSE over all held-out areas [dB]; NaN if the model has too few levels.
     difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
-        RMSE minus that of the best model of the flight on the same samples [dB].
+        RMSE minus the RMSE of the best model of the flight on the same samples [dB].
     n : int
         Number of samples that all compared models share.
     seconds : float
@@ -68,8 +68,8 @@ class ModelRow:
     fastest_sufficient : bool
         True for the first model, in the order of rising cost, whose difference from the best is not significant.
     distinct : bool
-        False if the error is within 0.01 dB of that of an earlier model on every channel. The recommended model and
-        that of the flight file are always distinct.
+        False if the error is within 0.01 dB of that of an earlier model on every channel. The recommended model and the
+        model of the flight file are always distinct.
     elsewhere_db : (float, float), optional
         RMSE of the recommended model and of free space on other flights [dB], if other flights selected the model.
     """
@@ -177,7 +177,8 @@ def compare_models(
     measured_db : sequence of (n,)
         Level of each series in time order [dB]; NaN is not scored.
     time_s : sequence of (n,)
-        Times by which the errors of all series are ordered, so that correlated errors of channels are adjacent [s].
+        Times [s]. The errors of all series are ordered by time, so that correlated errors of several channels are
+        adjacent.
     candidates : sequence of CandidateModel
         Models, simplest first: lines, then more and more paths and losses, which is also the order of their cost. Of
         two equal models, the earlier one is used.
@@ -216,7 +217,7 @@ def compare_models(
     place = np.concatenate([*position_m, np.zeros((0, 3))])[in_time]
     rmse = tuple(_rmse(e) for e in joined)
     replays = [i for i, candidate in enumerate(candidates) if candidate.regressor_db is None and np.isfinite(rmse[i])]
-    # a straight line is never recommended, because it is not valid at other places
+    # a straight line is never recommended, because it is not valid elsewhere
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
         recommended = next(i for i in replays if i == chosen or _as_good(compared(joined[i], joined[chosen], place)))
@@ -263,9 +264,9 @@ def _rows(
                           free_offset=False, place_m=place)
         for errors in ladder.error_db
     ]  # fmt: skip
-    # sufficient: the best model, and models whose difference has a known interval that contains 0
+    # sufficient are the best model, and each model whose difference from it has an interval that contains 0
     sufficient = [i for i, pair in enumerate(pairs) if i == ladder.best or pair.difference_ci95_db[0] <= 0.0]
-    fastest = min(sufficient)  # the order of the candidates, because measured seconds differ between equal runs
+    fastest = min(sufficient)  # by the order of candidates, because measured seconds vary between runs
     return [
         ModelRow(
             model=candidate.model,
@@ -286,9 +287,9 @@ def _rows(
 
 
 def _distinct(ladder: ModelComparison) -> set[int]:
-    """Return the indices of models with another error than every model before them, of the last and the recommended."""
+    """Return the indices of the last and the recommended model, and of models whose error no earlier model has."""
     rmse = np.array([[_rmse(error) for error in errors] for errors in ladder.error_db])
-    rmse = np.nan_to_num(rmse, nan=-1.0)  # two models without an error on a channel are equal there
+    rmse = np.nan_to_num(rmse, nan=-1.0)  # models without an error on a channel are equal there
     known: list[int] = []
     for index, own in enumerate(rmse):
         alike = (np.abs(rmse[known] - own) <= _SAME_DB).all(axis=1).any()
@@ -304,7 +305,7 @@ def held_out_error_db(
     place: IntArray,
     regressor_db: FloatArray | None = None,
 ) -> FloatArray:
-    """Return measured minus predicted level (n,), where the offset in each area comes from all other areas [dB].
+    """Return measured minus predicted level (n,), with the offset of each area fitted to all other areas [dB].
 
     Parameters
     ----------
@@ -367,7 +368,7 @@ def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: i
 
 
 def log_distance_level_db(measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray) -> FloatArray:
-    """Return the log-distance level (n,) about its mean, where the slope in each area comes from the other areas [dB].
+    """Return the log-distance level (n,) about its mean, with the slope of each area fitted to the other areas [dB].
 
     The offset is fitted by the comparison, as for every other model.
 

@@ -26,7 +26,7 @@ from .offset import SPAN_DB, OffsetFit, grid_offset, offset_grid
 from .receiver import brier_losses, log_losses, out_of_group
 from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
-# Two channels of one receiver differ if the difference of their levels is farther than this from its mean [dB].
+# Two channels of one receiver differ if the difference of their levels deviates from its mean by more than this [dB].
 PART_DB = 10.0
 # Averaging time of the difference of two channels [s].
 _PART_S = 1.0
@@ -59,7 +59,7 @@ class RssComparison:
     n_no_pose : int
         Samples without a pose, which are not compared.
     at_edge : bool
-        True if the offset is at the edge of the search span.
+        True if the offset is at the edge of the search range.
     correlation : float
         Pearson correlation; NaN for constant series.
     intervals : ErrorIntervals
@@ -71,7 +71,7 @@ class RssComparison:
     lag_s : float
         Applied clock lag [s]; NaN if none was estimated or applied.
     fitted_on_scored : tuple of str
-        Names of the parameters that were fitted on the scored samples.
+        Names of the parameters that were fitted to the scored samples.
     residual_db : (samples,)
         ``measured + offset - simulated``, NaN without a pair.
     """
@@ -125,7 +125,7 @@ def compare_rss(
     position_m : (n, 3), optional
         East, north and up [m], NaN if unknown. With positions, intervals also allow for correlation over position.
     span_db : (float, float)
-        Offset search.
+        Search range of the offset.
 
     Returns
     -------
@@ -158,7 +158,7 @@ def compare_rss(
 
 
 def _fit(measured_db: FloatArray, simulated_db: FloatArray, span_db: tuple[float, float]) -> OffsetFit:
-    # an offset fits one sample exactly, and the RMSE of two is half of their difference
+    # an offset fits a single sample exactly, and with two samples the RMSE is half of their difference
     fit = grid_offset(measured_db, simulated_db, span_db=span_db)
     return fit if fit.n > 2 else replace(fit, rmse_db=np.nan)
 
@@ -258,7 +258,7 @@ def _window_means(time: FloatArray, values: FloatArray, window_s: float) -> Floa
     return np.asarray(np.add.reduceat(np.append(values, 0.0), ends)[::2] / (last - first))
 
 
-# --- where the residual comes from ---------------------------------------------------------------------------------
+# --- geometry of the residual ---------------------------------------------------------------------------------
 
 
 def link_geometry(
@@ -428,7 +428,7 @@ class ChannelDifference:
     mean_db, std_db, correlation : float
         Mean and standard deviation of first minus second level [dB], and correlation of the levels.
     spans : list of ErrorSpan
-        Segments in which the difference is farther than :data:`PART_DB` from its mean, with their geometry.
+        Segments in which the difference deviates from its mean by more than :data:`PART_DB`, with their geometry.
     """
 
     n: int
@@ -446,7 +446,7 @@ def channel_difference(
     position_m: FloatArray | None = None,
     context: Mapping[str, ArrayLike] | None = None,
 ) -> ChannelDifference:
-    """Return the difference of two channels, with segments where it is farther than :data:`PART_DB` from its mean.
+    """Return the difference of two channels, with segments where it deviates from its mean by > :data:`PART_DB`.
 
     Parameters
     ----------
@@ -519,7 +519,7 @@ class DetectionForecast:
     per_db : float
         Slope of the log odds.
     share : float
-        Share of detected samples, averaged over the flights. It is the forecast where no level is predicted.
+        Share of detected samples, averaged over the flights. It is the forecast for samples without a predicted level.
     """
 
     level_db: float
@@ -544,7 +544,7 @@ def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> Detectio
     Returns
     -------
     DetectionForecast or None
-        None if one outcome is rare, or if P(detected) does not rise with the level.
+        None if detected or undetected samples are rare, or if P(detected) does not rise with the level.
     """
     from scipy.optimize import minimize
 
@@ -583,8 +583,8 @@ class DetectionScore:
         Floor of the receiver [unit of the measurement]. Lower levels are raised to it.
     n, n_detected : int
     brier, constant_brier, log_score, constant_log_score : float
-        Scores of P(detected) from the predicted level, and of the constant share of this flight, which is the best
-        forecast without a level. The Brier score is between 0 and 1. The log score is in nat.
+        Scores of P(detected) from the predicted level, and of a constant forecast: the share of this flight, which is
+        the best forecast without a level. The Brier score is between 0 and 1. The log score is in nat.
     learned_on : str
         ``other flights``, or ``held-out segments`` if each segment of this flight is predicted from the others.
     offset_db, rmse_db : float
@@ -592,12 +592,12 @@ class DetectionScore:
     rmse_ci95_db : (low, high)
         95 % interval of ``rmse_db``.
     free_space_rmse_db : float
-        RMSE of free space with the same floor.
+        RMSE of the free-space level with the same floor.
     detected_rmse_db : float
         RMSE of the detected samples with the same offset. Never show this number alone, because these samples are
         selected by their level.
     reliability : tuple of (float, float, int)
-        Mean probability, share detected, and number of samples, per fifth of the range of probability.
+        Mean probability, share of detected samples, and number of samples, for each fifth of the probability range.
     locks : bool
         True if the log contains the lock. Otherwise samples without a level count as not detected.
     """
@@ -651,7 +651,7 @@ def score_detection(
     Returns
     -------
     DetectionScore or None
-        None if one outcome is rare.
+        None if detected or undetected samples are rare.
     """
     finite = np.isfinite(simulated_db) & np.isfinite(time_s)
     time, simulated, detected = time_s[finite], simulated_db[finite], detected[finite]
@@ -704,7 +704,7 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     above = measured > floor_db
     middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
     grid = offset_grid(span_db=(middle - _SPAN_DB, middle + _SPAN_DB))
-    # in this order, the first k predictions are below the floor and set to it; all others move with the offset
+    # with sorted predictions, the first k are below the floor and set to it; all others shift with the offset
     low = np.concatenate([[0.0], np.cumsum((measured - floor_db) ** 2)])
     difference = simulated - measured
     first, second = (np.concatenate([[0.0], np.cumsum(difference**power)]) for power in (1, 2))
@@ -726,7 +726,7 @@ def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, 
 # Time between two values of AERPAW's sounder [s]: 4095 chips plus overhead of the correlation.
 BASE_S = 0.032768
 
-# The sounder's own time base is used if it raises the correlation by more than this.
+# The time base of the sounder is used if it raises the correlation by more than this.
 _BETTER = 0.1
 
 
@@ -782,7 +782,7 @@ class ServingComparison:
 
     @property
     def majority_share(self) -> float:
-        """Share of the most frequent serving cell. A useful prediction is right more often."""
+        """Share of the most frequent serving cell. The hit share of a useful prediction is larger."""
         return float(self.confusion.sum(axis=1).max() / self.n) if self.n else float("nan")
 
     def as_dict(self) -> dict[str, Any]:
@@ -843,7 +843,7 @@ def detection_floor_db(level_db: FloatArray, within_db: float = 0.0) -> float | 
 
 
 def nearest_in_time(times: AnyArray, of: AnyArray) -> tuple[IntArray, AnyArray]:
-    """Return the index in ``of`` (m,) nearest to each of ``times`` (n,) (the earlier of two), and its distance."""
+    """Return the index in ``of`` (m,) nearest to each of ``times`` (n,) (the earlier of two), and the distance."""
     order = np.argsort(of, kind="stable")
     at = of[order]
     after = np.clip(np.searchsorted(at, times), 0, len(at) - 1)
@@ -859,18 +859,18 @@ _TURNED_DEG = 45.0
 def nearest_points(
     position_m: FloatArray, points_m: FloatArray, reach_m: float, nose_deg: tuple[FloatArray, FloatArray] | None = None
 ) -> tuple[IntArray, BoolArray]:
-    """Return the nearest point (n,) of each sample, and whether it is near (n,).
+    """Return the index (n,) of the point nearest to each sample, and whether that point is near (n,).
 
     Parameters
     ----------
     position_m : (n, 3)
-        East, north, up of the samples; a sample with a NaN is near no point.
+        East, north, up of the samples. A sample with a NaN is not near any point.
     points_m : (points, 3)
         At least one.
     reach_m : float
         Largest distance of a near point.
     nose_deg : ((n,), (points,)), optional
-        Headings of samples and points. They are used only if all points and at least one sample have one.
+        Headings of samples and points. They are used only if all points and at least one sample have a heading.
 
     Returns
     -------
@@ -887,7 +887,7 @@ def nearest_points(
             for place, nose in zip((samples, points), nose_deg, strict=True)
         )
     known = np.asarray(np.isfinite(samples).all(axis=1))
-    # near points are within 2**0.5, and a bound makes the search for far samples fast
+    # near points are within 2**0.5, and the bound speeds up the search for far samples
     index = cKDTree(points).query(np.where(known[:, None], samples, 0.0), distance_upper_bound=1.5)[1]
     index = np.minimum(index, len(points) - 1)
     away = samples - points[index]
@@ -938,8 +938,8 @@ class FieldAudit:
     missing_paths, phantom_paths : int
         Number of paths that certainly exist but are missing, and of paths that cannot exist.
     doubtful : int
-        Number of paths and links that were not compared, because a micrometre (float32: two millimetres) decides
-        whether they exist.
+        Number of paths and links that were not compared, because a shift by a micrometre (float32: two millimetres)
+        decides whether they exist.
     failures : tuple of str
         Sentences about values out of tolerance.
     not_covered : tuple of str
@@ -971,7 +971,7 @@ class FieldAudit:
         return len(self.failures)
 
     def __add__(self, other: FieldAudit) -> FieldAudit:
-        """Return both audits as one: sums of counts, and the largest errors."""
+        """Return the combination of two audits: sums of counts, and the largest errors."""
         values: dict[str, Any] = {
             name: _together(name, getattr(self, name), getattr(other, name)) for name in self.__slots__
         }

@@ -1,9 +1,9 @@
-"""Position estimate of a transmitter at an unknown place, from the levels of one flight.
+"""Position estimate of a radio on the ground from the levels of one flight.
 
 In the model, the level falls with the logarithm of the distance, by an unknown slope. Both antennas add gains that
-depend on elevation, azimuth and the directions of the airframe. Shadowing is correlated over position or time. A
-level below the floor of the receiver has no value: it is only known to be below the floor. Several strengths and
-lengths are tried and weighted by their evidence.
+depend on elevation, azimuth and the directions of the airframe. Shadowing is correlated over position or time. A level
+below the floor of the receiver has no value: it is only known to be below the floor. Several strengths and correlation
+lengths of the shadowing are tried, and weighted by their evidence.
 """
 
 from __future__ import annotations
@@ -83,20 +83,21 @@ class LevelModel:
     cases: tuple[Case, ...] = ()
 
 
-# Standard deviation of a learned gain per degree of its harmonics, as a factor of that of its table.
+# Standard deviation of a learned gain for each degree of its harmonics, as a factor of the standard deviation in its
+# table.
 _LEARNED_SD = 0.25
 
 # Prior log odds of a learned gain against an unknown gain.
 _KNOWN_ODDS = 3.0
 
 # Gains over azimuth and over the directions of the airframe [dB]. If the attitude is unknown, the axes of the airframe
-# are those of the site, and stronger gains are also tried, with weights. If it is known, they are not: they raised the
-# error of one of six real flights from 41 to 67 m.
+# are those of the site, and stronger gains are also tried, with weights. If the attitude is known, stronger gains are
+# not tried: they raised the error of one of six real flights from 41 to 67 m.
 _GAINS = (0.8, 1.5)
 _STRONG_GAINS = {_GAINS: 0.55, (3.0, 3.0): 0.28, (6.0, 6.0): 0.17}
 
-# Shadowing is correlated over half a minute (as in a hover), and over position. Strong shadowing over a short length
-# with little scatter is not tried, because it is hard to distinguish from strong scatter.
+# Shadowing is correlated over half a minute, which matters in a hover, and over position. Strong shadowing over a short
+# length with little scatter is not tried, because it is hard to distinguish from strong scatter.
 _LENGTHS_M = (15.0, 45.0, 100.0)
 _SHADOWS = (
     Case(shadow_db=8.0, scatter_db=4.0, time_s=30.0),
@@ -108,12 +109,12 @@ _SHADOWS = (
     *(Case(shadow_db=sd, scatter_db=4.0, length_m=length) for sd, length in product((4.5, 8.0, 12.0), _LENGTHS_M)),
 )
 
-# A node about which nothing is known.
+# The model of a node about which nothing is known.
 UNKNOWN = LevelModel(cases=tuple(case.with_gains(*_GAINS) for case in _SHADOWS))
 
 
 def known_cases(shadow_db: float, scatter_db: float) -> tuple[Case, ...]:
-    """Return the cases of a level between two learned antennas, with the shadowing of their training flights."""
+    """Return the cases for a link between two learned antennas, with the shadowing of their training flights."""
     own = [Case(shadow_db=shadow_db, scatter_db=scatter_db, length_m=length) for length in _LENGTHS_M]
     own.append(Case(shadow_db=shadow_db, scatter_db=scatter_db, time_s=30.0))
     return tuple(replace(case, airframe_db=_LEARNED_SD, learned=True) for case in (*own, *_SHADOWS))
@@ -139,23 +140,23 @@ _HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
 # Smallest number of bins for a search.
 FEWEST = 20
 
-# Distance beyond the track up to which positions are tried, and their spacing. Likely positions are divided to a third
-# of it.
+# Distance beyond the track up to which positions are tried, and their spacing. Around likely positions, a third of the
+# spacing is used.
 _REACH_M, _SPACING_M = 400.0, 40.0
 
 # Largest numbers of positions of the first grid, and after dividing. The first grid has 1, 2, 4, 8 ... times the
 # spacing. The likeliest positions are then divided until the spacing is reached.
 _MOST_GRID, _MOST_DIVIDED = 500, 500
 
-# The level of a node this far away hardly changes along a flight. Levels that fit such a node as well as the best place
-# do not determine a place. Log odds of the best place: 4 to 76 on six real flights with a rover in reach, at most 0.3
-# for constant levels and hovers.
+# The level of a node this far away hardly changes along a flight. Levels that fit such a distant node as well as the
+# best position do not determine a position. Log odds of the best position: 4 to 76 on six real flights with a rover in
+# reach, at most 0.3 for constant levels and hovers.
 _AFAR_M, _PLACED_ODDS = 30_000.0, 0.5
 
 # Positions are ignored if their log evidence is lower than the maximum by more than this.
 _POSSIBLE = 8.0
 
-# The likeliest places are divided by three to the east and to the north.
+# Number of the likeliest positions whose spacing is divided by three to the east and to the north.
 _MOST_REFINED = 100
 
 # Prior standard deviation of the level at 100 m, which is unknown.
@@ -164,11 +165,11 @@ _FREE_DB = 100.0
 # Largest number of Newton steps of the Laplace approximation, and change [dB] at which they end.
 _STEPS, _SETTLED_DB = 12, 0.03
 
-# Number of places whose matrices are in memory at the same time.
+# Number of positions whose matrices are in memory at the same time.
 _AT_ONCE = 128
 
-# Largest number of cases of a search, and largest difference in log likelihood from the best case [nat]. Cases are
-# compared at this number of positions that are possible with a usual case.
+# Largest number of cases of a search, and largest difference in log likelihood from the best case [nat]. The third
+# number is the number of positions at which the cases are compared.
 _MOST_CASES, _LIKELY, _JUDGED = 8, 4.0, 60
 
 # Largest number of levels below the floor that are used, because the time grows with its cube.
@@ -236,7 +237,7 @@ def level_track(
     time, place, level = time[finite], place[finite], np.maximum(level[finite], floor_db)
     if not len(time):
         return LevelTrack(time, place, level, floor_db)
-    # slightly longer, because the last sample would otherwise have its own bin
+    # slightly longer: otherwise the last sample would be alone in a bin
     window = max(WINDOW_S, float(np.ptp(time)) / _MOST_BINS * 1.001)
     groups = np.unique(((time - time.min()) // window).astype(np.int64), return_inverse=True)[1]
     order = np.argsort(groups, kind="stable")
@@ -287,7 +288,7 @@ class _Shadowing:
     """Shadowing and scatter of the levels of a track.
 
     ``root`` (k, k) is the inverse lower root of the covariance of the k levels above the floor. ``across`` (j, k) times
-    their whitened values predicts the shadowing of the j levels below the floor, with the covariance ``left`` (j, j).
+    their whitened values predicts the shadowing of the j levels below the floor. Its covariance is ``left`` (j, j).
     """
 
     root: FloatArray
@@ -305,10 +306,10 @@ class _Shadowing:
 
 
 def _features(track: LevelTrack, places: FloatArray, model: LevelModel, learned: bool) -> FloatArray:
-    """Return the effects of unit-variance coefficients on a level, then the level above its mean (n, m, terms + 1)."""
+    """Return the effects of unit-variance coefficients on a level, then the level minus its mean (n, m, terms + 1)."""
     ray = track.position_m[None] - places[:, None]
     across = np.hypot(ray[..., 0], ray[..., 1])
-    # relative to 100 m, and at least 1 m, because the model is not valid below
+    # relative to 100 m, and at least 1 m, because the model is not valid at shorter distances
     decades = np.log10(np.maximum(np.hypot(across, ray[..., 2]), 1.0) / 100.0)
     elevation, towards = elevation_rad(ray), ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
     east, north, _ = np.moveaxis(towards, -1, 0)
@@ -356,7 +357,7 @@ def _fit(
 
 
 def _whitened(features: FloatArray, seen: BoolArray, shadow: _Shadowing) -> tuple[FloatArray, FloatArray]:
-    """Return whitened features above the floor (m, k, terms + 1), and features below it (m, j, ...) given these."""
+    """Return whitened features above the floor (m, k, terms + 1), and those below it, given these (m, j, terms + 1)."""
     flat = features.reshape(len(features), -1)
     above = shadow.root @ flat[seen]
     below = flat[~seen] - shadow.across @ above
@@ -392,7 +393,7 @@ def _below_floor(mean: FloatArray, covariance: FloatArray, scatter_db: float) ->
     Parameters
     ----------
     mean, covariance : (m, j) and (m, j, j)
-        Moments of the levels relative to the floor, given those above it, without scatter [dB, dB^2].
+        Moments of the levels relative to the floor, given the levels above the floor, without scatter [dB, dB^2].
     scatter_db : float
     """
     eye, latent = np.eye(mean.shape[1]), np.minimum(mean, 0.0)
@@ -433,7 +434,7 @@ class Mode:
     Parameters
     ----------
     place_m : (2,)
-        Its likeliest position, east and north.
+        Likeliest position in this part: east and north [m].
     share : float
         Share of the posterior in this part.
     radius_m : float
@@ -447,7 +448,7 @@ class Mode:
 
 @dataclass(frozen=True, slots=True)
 class Regions:
-    """The posterior of a node's place in cells.
+    """The posterior of a node's position, in cells.
 
     Parameters
     ----------
@@ -463,7 +464,7 @@ class Regions:
 
     @classmethod
     def of(cls, places: FloatArray, share: FloatArray, sd_m: float = SYSTEMATIC_M) -> Regions:
-        """Return the shares (m,) of places (m, 2 or more), blurred by a standard deviation per axis [m]."""
+        """Return the regions of shares (m,) at positions (m, 2 or more), blurred by the SD ``sd_m`` per axis [m]."""
         reach = 4.0 * sd_m
         area = float(np.prod(np.ptp(places[:, :2], axis=0) + 2.0 * reach))
         cell = max(_CELL_M * sd_m / SYSTEMATIC_M, float(np.sqrt(area / _MOST_CELLS)))
@@ -500,7 +501,7 @@ class Regions:
         return tuple(sorted((mode for mode in out if mode.share >= _LEAST_SHARE), key=lambda mode: -mode.share))
 
     def radius_m(self, place_m: FloatArray, part: float) -> float:
-        """Return the radius of the circle about a place that contains a share of the posterior."""
+        """Return the radius of the circle about a position that contains a share of the posterior."""
         east, north = np.meshgrid(self.east_m - place_m[0], self.north_m - place_m[1], indexing="ij")
         return _within(np.column_stack([east.ravel(), north.ravel()]), self.share.ravel(), part)
 
@@ -529,14 +530,14 @@ def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeEstimate:
-    """The place of a node, estimated from the levels of a flight.
+    """The position of a node, estimated from the levels of a flight.
 
     Parameters
     ----------
     place_m : (3,)
-        East, north and height above ground of the likeliest place.
+        East, north and height above ground of the likeliest position.
     radius90_m : float
-        Radius about the place that contains 90 % of the posterior.
+        Radius of the circle about this position that contains 90 % of the posterior.
     height_m : (low, high)
         Range of possible heights.
     slope, slope_sd : float
@@ -563,14 +564,14 @@ class NodeEstimate:
 
 
 def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
-    """Estimate the place, height and slope that explain the levels of a flight best.
+    """Estimate the position, height and slope that explain the levels of a flight best.
 
     Parameters
     ----------
     track : LevelTrack
         At least :data:`FEWEST` bins.
     model : LevelModel
-        Prior of slope, gains and shadowing, by default that of an unknown node.
+        Prior of slope, gains and shadowing. The default is the prior of an unknown node.
 
     Raises
     ------
@@ -617,7 +618,7 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
         slope=float(fits.slope[nearest]),
         slope_sd=float(fits.slope_sd[nearest]),
         anywhere=anywhere,
-        # a UAV that only turns on the spot shows the gain of its airframe, not the distance of the node
+        # the levels of a UAV that only turns on the spot depend on its airframe gain, not on the distance of the node
         placed=bool(
             fits.evidence.max() - afar > _PLACED_ODDS and np.ptp(track.position_m, axis=0).max() > SYSTEMATIC_M
         ),
@@ -637,7 +638,7 @@ def _thinned(track: LevelTrack) -> LevelTrack:
 
 
 def _likely_cases(track: LevelTrack, grid: FloatArray, model: LevelModel) -> LevelModel:
-    """Return the model with only its likely cases, at the positions of a grid (n, 2) that fit a usual case."""
+    """Return the model with only its likely cases, compared at positions of a grid (n, 2) that fit a usual case."""
     from scipy.special import logsumexp
 
     if len(model.cases) <= _MOST_CASES:
@@ -653,13 +654,13 @@ def _likely_cases(track: LevelTrack, grid: FloatArray, model: LevelModel) -> Lev
 
 
 # Prior of the position: a Cauchy distribution of the distance from the track, because flights are planned near the
-# radio. Its width is this factor times the RMS distance of the track from its centre. For towers, it is the second
-# value [m].
+# radio. The width of the distribution is this factor times the RMS distance of the track from its centre. For towers,
+# the width is the second value [m].
 _NEAR, _NEAR_TOWERS_M = 1.5, 150.0
 
 
 def _log_near(track: LevelTrack, places: FloatArray, width_m: float | None = None) -> FloatArray:
-    """Return the log prior (m,) of places (m, 3) by their distance from the track."""
+    """Return the log prior (m,) of positions (m, 3) by their distance from the track."""
     flat = track.position_m[:, :2]
     width_m = width_m or max(_NEAR * float(np.sqrt(flat.var(axis=0).sum())), _SPACING_M)
     away = [np.hypot(*(place[:2] - flat).T).min() for place in places]
@@ -667,7 +668,7 @@ def _log_near(track: LevelTrack, places: FloatArray, width_m: float | None = Non
 
 
 def _log_height(places: FloatArray) -> FloatArray:
-    """Return the log prior of the height of places (m, 3)."""
+    """Return the log prior of the height of positions (m, 3)."""
     return np.log([_HEIGHTS_M[height] for height in places[:, 2].tolist()])
 
 
@@ -692,8 +693,8 @@ def _searched(
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Return the likeliest positions of a grid, divided until their spacing is :data:`_SPACING_M`.
 
-    Returns places (m, 3), their log evidence (m,), their spacing [m] and the log evidence of any place of the grid. If
-    too many positions are possible, they are not divided, because the levels do not determine the position better.
+    Return also the log evidence (m,) of the positions (m, 3), their spacing [m] and the log evidence of the whole grid.
+    If too many positions are possible, they are not divided, because the levels do not determine the position better.
     """
     from scipy.special import logsumexp
 
@@ -722,8 +723,8 @@ def _divided(places: FloatArray, steps_m: Sequence[float]) -> FloatArray:
     return np.asarray((places[:, None] + moved).reshape(-1, 3))
 
 
-# Model for comparing a known position with any other: nearly free space, and unknown antennas. It was chosen on
-# simulated flights.
+# Model for comparing a known position with all other positions: nearly free space, and unknown antennas. It was chosen
+# on simulated flights.
 _TOWERS = LevelModel(
     slope=2.1,
     slope_sd=0.3,
@@ -739,8 +740,8 @@ _TOWER_SPACING_M = 60.0
 def place_odds(track: LevelTrack, known_m: ArrayLike) -> FloatArray:
     """Return the log odds (k,) of known positions, such as towers, against any position around the track.
 
-    The evidence is integrated over position, gain, slope and antennas, so that another position is preferred only if it
-    fits better than by its additional freedom.
+    The evidence is integrated over position, gain, slope and antennas, so that another position is preferred only if
+    its better fit outweighs its additional freedom.
 
     Parameters
     ----------

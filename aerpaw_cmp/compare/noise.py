@@ -36,7 +36,7 @@ class NoiseParameters(NamedTuple):
 
     @property
     def log_prior(self) -> float:
-        """Log prior density of the parameters: log normal in the slow correlation time, if that is longer than usual.
+        """Log prior density of the parameters: log normal in slow correlation times that are longer than usual.
 
         Without this prior, fading that lasts minutes could explain every error.
         """
@@ -71,7 +71,7 @@ def _whitening(parameters: NoiseParameters) -> tuple[tuple[float, float, float],
     The sum of two first-order autoregressive sequences is an ARMA(2, 1) sequence (Granger and Morris).
     """
     share = _SLOW_SHARE[parameters.share]
-    # set the correlation of a part with a share of 0 to 0, so that equal noise has exactly equal likelihoods
+    # set the correlation of a part with a share of 0 to 0: equal noise then has exactly equal likelihoods
     slow, fast = _SLOW[parameters.slow] * (share > 0.0), _FAST[parameters.fast] * (share < 1.0)
     shocks = share * (1.0 - slow**2), (1.0 - share) * (1.0 - fast**2)
     power = shocks[0] * (1.0 + fast**2) + shocks[1] * (1.0 + slow**2)
@@ -100,7 +100,7 @@ def _whitened(columns: FloatArray, parameters: NoiseParameters) -> FloatArray:
     from scipy.linalg.lapack import dtbtrs  # scipy.signal takes 0.4 s to load
 
     ahead, back, root = _whitening(parameters)
-    # assume that values before the first equal the first; Fortran order, because LAPACK solves by column
+    # assume that values before the first row equal the first row. Use Fortran order, because LAPACK solves by column.
     before = np.empty((len(columns) + 2, columns.shape[1]), order="F")
     before[:2], before[2:] = columns[:1], columns
     moved = ahead[0] * before[2:] + ahead[1] * before[1:-1] + ahead[2] * before[:-2]
@@ -116,7 +116,7 @@ def fit_under_noise(residual: FloatArray, designs: Sequence[Columns], at: NoiseP
     """Fit the coefficients of some designs (n, k) to a residual (n,) under noise with the given parameters.
 
     Coefficients have a unit normal prior. The likelihood is integrated over the coefficients, and the residual uses
-    their posterior means. The size of the noise is the most likely one.
+    their posterior means. The noise has its most likely standard deviation.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def fit_under_noise(residual: FloatArray, designs: Sequence[Columns], at: NoiseP
     at : NoiseParameters
         Parameters of the noise, or the start of the search.
     search : bool
-        True to search the most likely parameters, starting from ``at`` and from fixed starts.
+        True to search for the most likely parameters, starting from ``at`` and from fixed starts.
 
     Returns
     -------
@@ -162,10 +162,10 @@ def _fits(residuals: FloatArray, designs: Sequence[Columns], at: NoiseParameters
         gram = white.T @ white
         power, axes, _ = dsyevd(gram[1:, 1:])
         power, along = np.maximum(power, 0.0), axes.T @ gram[1:, 0]
-        # the samples do not determine all directions of the coefficients
+        # ignore combinations of coefficients that the samples do not determine
         fixed = power > 1e-9 * power[-1]
         left = max(float(gram[0, 0] - (along[fixed] ** 2 / power[fixed]).sum()), n * LEAST_VARIANCE)
-        # each coefficient that is determined uses one degree of freedom
+        # a coefficient that is fully determined uses one degree of freedom
         variance = left / max(n - float((power / (power + left / n)).sum()), 1.0)
         mean = along / (power + variance)
         square = float(gram[0, 0] - along @ mean) / variance
@@ -202,7 +202,7 @@ def shifts_in_masks(
 def squares_of_halves(error: FloatArray, columns: FloatArray, memory: float) -> tuple[float, float]:
     """Return the sums of squares of an error (n,) without and with a fit of columns (n, k) to the other half.
 
-    ``memory`` is the number of samples per independent sample of the error.
+    ``memory`` is the number of consecutive samples that count as one independent sample of the error.
     """
     before = after = 0.0
     first = np.arange(len(error)) < len(error) // 2

@@ -23,7 +23,7 @@ STEP_DB = 0.1
 # Largest number of offsets. A longer grid is the result of a wrong step or range, and would not fit in memory.
 MAXIMUM_OFFSETS = 10_000_000
 
-# Larger levels [dB] are limited to this value.
+# Largest magnitude of a level that is used [dB]. Larger levels are clipped to it.
 _LARGEST_DB = 1e150
 
 # Distances that differ by less than this share of a step are equal (0.15 is exactly between 0.1 and 0.2).
@@ -85,7 +85,7 @@ def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
 
 
 def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_DB) -> int:
-    """Return the index of the offset nearest to ``target_db``. Of two equally near offsets, return that nearer zero."""
+    """Return the index of the offset nearest to ``target_db``. If two are equally near, return the one nearer zero."""
     # clip the target to the grid, because in float64 all offsets are equally far from 1e30
     distance = np.abs(grid_db - np.clip(target_db, grid_db[0], grid_db[-1]))
     near = np.flatnonzero(distance <= distance.min() + _TIE * step_db)

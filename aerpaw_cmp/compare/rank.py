@@ -1,7 +1,7 @@
 """The rank of a channel, and the comparison of two sequences of ranks.
 
 The rank is the number of singular values strictly above ``sigma_1 / K``. Rank 0 means that there is no channel. The
-measured RI is a float. It is NaN where the modem reported no CSI, and never 0.
+measured RI is a float. It is NaN if the modem reported no CSI, and never 0.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from . import statistics
 # Largest rank in histograms. The modems of AERPAW report RI 1 to 4.
 MAX_RANK = 4
 
-# Number of matrix entries per SVD batch, which limits the memory.
+# Number of matrix entries per SVD batch. It limits the memory that is used.
 _CHUNK = 1 << 20
 
 
@@ -73,7 +73,7 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
     largest = values.max(axis=-1, keepdims=True)
     margin = 8.0 * np.finfo(np.float64).eps
     above = values > largest * (1.0 / k + margin)
-    # the largest value counts by definition if it is positive
+    # the largest singular value always counts if it is positive
     alive = (largest[..., 0] > 0) & np.isfinite(largest[..., 0])
     rank = above.sum(axis=-1)
     if k > 1:
@@ -240,7 +240,8 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 
 
-# Number of parts of a flight that are swapped. Parts are much longer than most correlations, and there are 2048 swaps.
+# Number of parts of a flight that are swapped. With twelve parts, a part is much longer than most correlation times,
+# and there are 2048 combinations of swaps.
 _PARTS = 12
 
 
@@ -258,7 +259,8 @@ def histogram_test(measured: ArrayLike, simulated: ArrayLike) -> float:
     Returns
     -------
     float
-        Share of all swaps with a total variation at least as large, including the observed one. NaN without a pair.
+        Share of all combinations of swaps, including the observed ranks, with a total variation at least as large. NaN
+        if no sample has both ranks.
     """
     measured_rank, simulated_rank = _pairs(measured, simulated)
     if not len(measured_rank):
@@ -273,7 +275,7 @@ def histogram_test(measured: ArrayLike, simulated: ArrayLike) -> float:
     return float(np.mean(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9))
 
 
-# --- what explains the modem's decision ----------------------------------------------------------------------------
+# --- the modem's decision ----------------------------------------------------------------------------
 
 
 def k_grid() -> FloatArray:
@@ -290,9 +292,10 @@ class KCurve:
     Parameters
     ----------
     k, agreement : (m,)
-        Values of K, and the agreement of simulated with measured ranks at each.
+        Values of K, and the agreement of simulated with measured ranks at each K.
     best_k : float
-        K with the best agreement. Of several, it is the middle (on a log scale) of the first run. NaN without a pair.
+        K with the best agreement. If several neighbouring values are equally good, their middle on a log scale. NaN if
+        no pose has both ranks.
     best_k_ci95 : (low, high)
         Range of K whose agreement is not significantly worse on the same samples (95 %), one grid step wider on either
         side.
@@ -327,14 +330,14 @@ def k_curve(
     """
     grid = k_grid() if k is None else unmasked(k)
     ri, profile = _ranks(measured), unmasked(sigma)
-    # any K, because it does not matter for the existence of a channel
+    # any value of K shows whether there is a channel
     paired = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
     if not paired.any():
         return KCurve(k=grid, agreement=np.full(len(grid), np.nan))
     # store one byte per sample and K, because there are 118 values of K
     equal = np.stack([rank_from_singular_values(profile[paired], value) == ri[paired] for value in grid], axis=1)
     agree, place = equal.mean(axis=0), None if place_m is None else place_m[paired]
-    # middle of the first run of best K, on the logarithmic scale of the grid
+    # take the middle of the first run of equally good K, on the logarithmic scale of the grid
     first = int(np.argmax(agree))
     run = np.flatnonzero(np.append(agree[first:], -1.0) < agree[first] - 1e-12)[0]
     ends = statistics.NO_INTERVAL
@@ -358,8 +361,8 @@ class Staleness:
     hold_s : float
         Median time for which a report was held [s]. NaN for fewer than two reports.
     verdict : str
-        ``"fresh"`` (at most every tenth row is a repetition), ``"held"``, ``"constant"`` (there is only one value, so
-        repetitions cannot be detected) or ``"no rank"``.
+        ``"fresh"`` (at most a tenth of the rows are repetitions), ``"held"``, ``"constant"`` (there is only one value,
+        so repetitions cannot be detected) or ``"no rank"``.
     """
 
     fresh: BoolArray
@@ -379,7 +382,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
         RI, NaN if missing.
     further : mapping of str to array_like (n,), optional
         Other numbers of the same report (RSRP, SINR, CQI). A row that repeats **all** of them is a repetition, because
-        RSRP and SINR hardly ever repeat by chance. Without such numbers, the changes of RI are used: if they occur at
+        RSRP and SINR hardly ever repeat by chance. Without other numbers, the changes of RI are used: if they occur at
         multiples of a period of several rows, there is one report per period.
     """
     time, ri = unmasked(time_s), _ranks(rank)
@@ -388,7 +391,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
     columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (further or {}).values())]
     if len(columns) > 1:
-        # without other numbers, a row cannot be recognised as a repetition
+        # a row without other numbers cannot be recognised as a repetition
         has_values = np.any([np.isfinite(c) for c in columns[1:]], axis=0)
         fresh = known & (_changes(columns) | ~has_values)
     else:
@@ -410,7 +413,7 @@ def _changes(columns: Sequence[FloatArray]) -> BoolArray:
 
 
 def _period_starts(ri: FloatArray) -> BoolArray:
-    """Return a mask of first rows of reports: one per period if RI changes at multiples of a period, else all rows."""
+    """Return a mask of the first row of each report: once per period, or every row if RI has no period."""
     change = np.flatnonzero(_changes([ri]))[1:]
     if len(change) < 8:  # too few changes to distinguish a period from chance
         return np.ones(len(ri), dtype=bool)
@@ -437,7 +440,7 @@ class RankFit:
     out_of_coverage : int
         Number of poses without a channel.
     agreement, kappa, total_variation, wasserstein : float
-        Agreement with the measured ranks and distances from them, each with a 95 % interval.
+        Agreement with the measured ranks, and distances from their histogram, each with a 95 % interval.
     confusion : (5, 5) int
         Confusion matrix. Rows are measured, columns simulated ranks, starting with rank 0 (missing).
     p_histogram : float
@@ -472,7 +475,7 @@ class RankComparison:
     histogram : (4,)
         Measured shares of rank 1 to 4, with intervals in ``histogram_ci95``.
     simulated : mapping of float to RankFit
-        Comparison for each K.
+        Comparison for each threshold K.
     curve : KCurve
         Comparison for continuous K.
     staleness : Staleness
@@ -555,7 +558,8 @@ def _histogram_intervals(rank: FloatArray, place_m: FloatArray | None = None) ->
 def compare_ranks(measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray | None = None) -> RankFit:
     """Compare two sequences of ranks by pose and by histogram.
 
-    The histogram distances compare all measured with all simulated ranks. Their intervals come from poses with both.
+    The histogram distances compare all measured with all simulated ranks. Their intervals come from poses that have
+    both.
 
     Parameters
     ----------
@@ -650,14 +654,14 @@ class RankRepeat:
 def repeat_rank(
     first: statistics.Visit, second: statistics.Visit, radius_m: float = statistics.SAME_PLACE_M
 ) -> RankRepeat:
-    """Return the kappa of the ranks that two passes of a flight report at the same places.
+    """Return the kappa of the ranks that two passes of a flight report at the same positions.
 
     Parameters
     ----------
     first, second : Visit
         Visits whose values are ranks. 0 and NaN are ignored.
     radius_m : float
-        A sample is paired with the nearest sample of the other pass within this distance.
+        Largest distance to the nearest sample of the other pass, with which a sample is paired.
 
     Returns
     -------
@@ -681,7 +685,7 @@ def _pair_intervals(
     if len(a) < statistics.FEWEST:
         return [statistics.NO_INTERVAL] * 4
     equal, *influences = _influences((a == b).astype(np.float64), one_hot(a), one_hot(b))
-    # Wilson's interval for the agreement, because it has a width even at shares of 0 and 1
+    # use Wilson's interval for the agreement, because its width is not 0 at shares of 0 and 1
     return [statistics.share_interval(equal, place_m, a.astype(np.float64))] + [
         statistics.influence_interval(value, influence, place_m, bounds)
         for value, influence, bounds in zip(

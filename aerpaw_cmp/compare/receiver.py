@@ -2,7 +2,7 @@
 
 A forecast contains a probability for each rank. It is scored by the log score, which is a proper score, and compared
 with the constant forecast (the histogram of the training flights). The rank that is decided from the probabilities is
-scored by kappa and agreement, and compared with the most frequent rank.
+scored by kappa and agreement. It is compared with the most frequent rank.
 
 A receiver chooses the rank with the largest throughput at its noise level. Logs contain neither its codebook nor its
 channel estimate. The module therefore learns how often each rank is reported, given the level and the ratios of
@@ -43,7 +43,7 @@ def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
     probability : (n, ranks)
         Probability of each rank, with rows that sum to one.
     rank : (n,)
-        Reported.
+        Reported rank of each sample.
 
     Notes
     -----
@@ -74,7 +74,7 @@ def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
 
 def constant_forecast(rank: ArrayLike) -> FloatArray:
-    """Return the histogram of training ranks (MAX_RANK,), with one added per rank so that no rank is impossible."""
+    """Return the histogram of training ranks (MAX_RANK,). One sample is added per rank: no rank is impossible."""
     values = unmasked(rank)
     count = np.bincount(values[values >= 1].astype(np.int64), minlength=MAX_RANK + 1)[1:] + 1.0
     return np.asarray(count / count.sum())
@@ -87,7 +87,7 @@ class ForecastScore:
     Parameters
     ----------
     n : int
-        Samples with a report and a forecast.
+        Number of samples with a report and a forecast.
     kappa, agreement : float
         Scores of the decided rank.
     majority_agreement : float
@@ -95,9 +95,9 @@ class ForecastScore:
     log_score, constant_log_score : float
         Means of :func:`log_losses` for the forecast and for the constant forecast [nat].
     log_score_gain : float
-        Share by which the log score of the forecast is below that of the constant forecast.
+        Share by which the log score of the forecast is lower than that of the constant forecast.
     log_score_difference_ci95 : (low, high)
-        95 % interval of log score of forecast minus that of the constant forecast, on the same samples [nat].
+        95 % interval of the log score of the forecast minus that of the constant forecast, on the same samples [nat].
     total_variation_expected : float
         Total variation distance between mean probabilities and measured histogram.
     kappa_ci95, log_score_ci95, total_variation_ci95 : (low, high)
@@ -181,7 +181,7 @@ _CHOICE_PENALTY = 10.0
 # Smallest number of training samples for a fit.
 FEWEST = 50
 
-# Numbers in one batch of regressions, which limits the memory to about 100 MiB.
+# Number of values in one batch of regressions. It limits the memory to about 100 MiB.
 _HELD = 1 << 22
 
 
@@ -234,7 +234,7 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
 
     Notes
     -----
-    A receiver uses a channel estimate that is seconds old, the network schedules the rank that was reported before, and
+    A receiver uses a channel estimate that is seconds old. The network schedules the rank that was reported before, and
     the positions of a handset are also late. A log does not separate these delays. Fast ripple of the modelled channel
     within these seconds does not affect a report.
 
@@ -261,8 +261,8 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
 def sector_groups(position_m: FloatArray, tower_m: FloatArray) -> IntArray:
     """Return the eighth of azimuths from the tower for each sample (n,), with about equal numbers of samples.
 
-    A held-out sector contains directions that the fit has not seen. Samples that are neighbours in time are mostly in
-    the same sector.
+    A held-out sector contains directions that were not used in the fit. Samples that are neighbours in time are mostly
+    in the same sector.
     """
     # start at the largest gap between directions, so that the start does not split a cluster of samples
     azimuth = azimuth_rad(position_m[:, :2] - np.asarray(tower_m)[:2])
@@ -376,7 +376,7 @@ def _softmax(score: FloatArray) -> FloatArray:
 
 
 def _over_ranks(operation: np.ufunc, values: FloatArray) -> FloatArray:
-    """Return ``operation.reduce`` over the last axis, which has few elements. A loop over them is ten times faster."""
+    """Return ``operation.reduce`` over the last axis. It has few elements, and a loop over them is ten times faster."""
     return np.asarray(reduce(operation, np.moveaxis(values, -1, 0)))
 
 
@@ -418,12 +418,12 @@ def _fit_multinomial(
     Parameters
     ----------
     x : (..., n, features)
-        Standardised.
+        Standardised features.
     weight : (n,)
         Weight of each sample, 0 or 1.
     penalty : float
         ``penalty / 2`` times the sum of squared slopes is subtracted from the log likelihood. The constants have a
-        thousandth of this weight, which is enough to determine their common shift.
+        thousandth of this weight, which is enough to fix the shift that all constants have in common.
 
     Notes
     -----
@@ -434,7 +434,7 @@ def _fit_multinomial(
     target = one_hot(rank) * weight[:, None]
     ridge = np.full(width, penalty)
     ridge[0] = 1e-3 * penalty
-    # add half a report, so that the constant of a rank without reports is finite
+    # add half a report, so that the constant is also finite for a rank without reports
     start = np.log((target.sum(axis=0) + 0.5) / (weight.sum() + 0.5 * MAX_RANK))
     coefficient = np.zeros((*lead, MAX_RANK, width))
     coefficient[..., 0] = start - start.mean()
@@ -512,7 +512,7 @@ def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) 
 
 
 def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
-    """Return weights (ranks,) that maximise kappa: one for ranks below, and one for ranks above the most frequent rank.
+    """Return weights (ranks,) that maximise kappa: one weight below and one above the most frequent rank.
 
     Without weights, the most frequent rank would be decided too often, and kappa rewards rare ranks. The two weights
     are searched on a grid. Of weights with equal kappa, those nearest to 1 are used.
@@ -561,16 +561,16 @@ class ReceiverMixture:
 def fit_mixture(
     features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = _PENALTIES
 ) -> ReceiverMixture:
-    """Fit one receiver per geometry. Penalty and decision weights are those best for the mean of their forecasts.
+    """Fit one receiver per geometry. Penalty and decision weights are chosen for the mean forecast.
 
     Parameters
     ----------
     features : (geometries, n, features)
-        For example, those of :attr:`FeatureChoice.tied`.
+        Features of each geometry, for example those of :attr:`FeatureChoice.tied`.
     rank : array_like, (n,)
         Reported rank. Samples without a rank (NaN, 0) or without features are ignored.
     groups : (n,) int
-        Group of each sample, e.g. :func:`sector_groups`. Each group is held out once.
+        Group of each sample, for example from :func:`sector_groups`. Each group is held out once.
     penalties : sequence of float
         Candidate penalties. The log loss on held-out groups selects one.
 
@@ -606,7 +606,7 @@ class FeatureChoice:
         Candidates that were cross-validated, best first.
     tied : tuple of int
         Candidates that are not significantly worse than the best: the 95 % interval of the difference of log scores on
-        the same samples contains 0. The best comes first.
+        the same samples contains 0. The best candidate comes first.
     """
 
     order: IntArray
@@ -631,8 +631,8 @@ def choose_features(
         Group of each sample. Each group is held out once.
     finalists : int
         Number of candidates that are cross-validated. They are the candidates with the highest likelihood on the
-        training samples. This is fair, because all candidates have the same number of coefficients, and a fit takes
-        only a tenth of the time of a cross-validation.
+        training samples. The likelihood is a fair criterion, because all candidates have the same number of
+        coefficients. A fit takes only a tenth of the time of a cross-validation.
 
     Returns
     -------
@@ -676,7 +676,7 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> flo
 
 def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     z = _standardised(x)
-    # a few steps suffice, because a rough likelihood is enough to exclude candidates
+    # a few steps suffice, because a rough likelihood is enough to exclude bad candidates
     weights = _fit_multinomial(z, rank, np.ones(len(rank)), _CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(item, rank).mean() for item in p])

@@ -12,10 +12,10 @@ from .gains import BAND, NO_SPREAD, LostLock, StatedSpread
 from .level import local_mean_db
 from .statistics import correlation
 
-# Averaging window of the second error [s].
+# Averaging window of ``rmse_1s_db`` [s].
 WINDOW_S = 1.0
 
-# Name of the model of the scored report in the cards.
+# Name, in the cards, of the model of the scored report.
 OURS = "ray tracing (this report)"
 
 # Numbers of a card that are averaged over channels.
@@ -46,8 +46,8 @@ def level_card(
     predicted : mapping of str to (n,)
         ``level``: predicted median [dB], NaN where nothing is predicted. Optional, and used if they are known on all
         samples with both levels: ``sd_db`` (standard deviation of one sample; the error is normal), ``q05_db`` and
-        ``q95_db`` (ends of the 90 % interval, else those of the distribution), and the columns :data:`LOCK` (two parts,
-        instead of a normal error).
+        ``q95_db`` (ends of the 90 % interval; the default is those of the distribution), and the columns :data:`LOCK`
+        (two parts, instead of a normal error).
     scored : (n,) bool
         Samples that the prediction covers. There, a predicted NaN means a predicted outage.
     thresholds_db : sequence of float
@@ -65,15 +65,15 @@ def level_card(
           common reference.
         - ``offset_db rmse_offset_db``: offset that is added to the measurement, and RMSE after this offset. It is
           fitted on the scored samples.
-        - ``rmse_1s_db``: RMSE of means over 1 s, after their own offset.
+        - ``rmse_1s_db``: RMSE of means over 1 s, with a separate offset.
         - ``correlation slope``: Pearson correlation, and slope of measured over predicted level (least squares). NaN
           if the prediction is constant.
         - ``crps_db coverage_90``: continuous ranked probability score and share inside the 90 % band; None without a
           band.
         - ``exceedance``: for each threshold the ``predicted`` and ``measured`` share of samples at or above
           ``threshold_db``. If the levels have no common reference, the offset is applied first.
-        - ``outages_missed outages_invented``: number of outages where a level was predicted, and of levels where an
-          outage was predicted.
+        - ``outages_missed outages_invented``: number of outages for which a level was predicted, and of levels for
+        which an outage was predicted.
     """
     level = predicted["level"]
     heard, reached = np.isfinite(measured_db) & scored, np.isfinite(level) & scored
@@ -81,7 +81,7 @@ def level_card(
     measured, expected = measured_db[both], level[both]
     error = measured - expected
     slow = local_mean_db(time_s[both], measured, WINDOW_S) - local_mean_db(time_s[both], expected, WINDOW_S)
-    # rounding would give a constant prediction a correlation
+    # rounding errors of a constant prediction must not produce a correlation
     r = correlation(measured, np.round(expected, 6))
     crps, inside = _distribution(measured_db, predicted, both) if absolute else (None, None)
     # an outage counts as below any threshold

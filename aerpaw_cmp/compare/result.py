@@ -48,8 +48,8 @@ class ClockResult:
     """The radio clock of a receiver (a tower) compared with the telemetry clock.
 
     ``radio_minus_telemetry_s`` is positive if the radio clock shows later times. Radio times are corrected by
-    subtracting it. ``applied`` is one of the states above. ``checks`` contains the tests that led to the verdict, by
-    name.
+    subtracting it. ``applied`` is one of the states :data:`APPLIED`, :data:`NOT_APPLIED`, :data:`ESTIMATED` and
+    :data:`GIVEN`. ``checks`` contains the results of the tests behind the verdict, by name.
     """
 
     receiver: str
@@ -92,7 +92,7 @@ class Cause:
     rmse_db, rmse_with_db : float
         RMSE of 1-s means of these channels without and with the cause [dB].
     gain : float
-        Log odds of all explanations with the cause against all without it.
+        Log odds of all explanations with the cause against all explanations without it.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelLevel:
-    """Another simulation of the same samples: level (n,) [dBm] and its own best offset."""
+    """Another simulation of the same samples: level (n,) [dBm], and the best offset for it."""
 
     level_dbm: FloatArray
     offset_db: float
@@ -132,13 +132,13 @@ class SnrScore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssFurther:
-    """Numbers of a tower and channel other than offset, RMSE and correlation, with their names in metrics.json.
+    """Further numbers of a tower and channel, with their names in metrics.json, next to those of ``RssComparison``.
 
-    A field without a default is always written. A field whose default is None is written only if the flight has it.
-    ``n_flagged`` counts samples by reason. ``compared_with`` contains, for each baseline and each other assumption,
-    whether the replay is better or worse on the same samples. The keys of ``averaged`` are simulation and window.
-    ``n_outliers`` counts samples far outside the distribution of the levels of the channel; only
-    ``rmse_without_outliers_db`` excludes them. The other counts are those of
+    A field without a default is always written. A field whose default is None is written only if it applies to the
+    flight. ``n_flagged`` counts samples by reason. ``compared_with`` contains, for each baseline and each other
+    assumption, whether ray tracing is better or worse on the same samples. The keys of ``averaged`` are simulation and
+    window. ``n_outliers`` counts samples far outside the distribution of the levels of the channel; only
+    ``rmse_without_outliers_db`` excludes these samples. The other counts are those of
     :class:`~aerpaw_cmp.compare.level.RssComparison`.
 
     Parameters
@@ -156,9 +156,10 @@ class RssFurther:
     error_bars : mapping of str to float, optional
         Parts of that standard deviation [dB], and the shares of samples inside the stated 50, 90 and 95 % intervals.
     elsewhere : mapping, optional
-        Errors of learned antennas on held-out flights of a ``kind`` [dB]: RMSE, of free space too, and of 4-s means.
+        Errors of learned antennas on held-out flights of a ``kind`` [dB]: RMSE, RMSE of free space, RMSE of 4-s means.
     trained_on : tuple of str, optional
-        SHA-256 of this series' logs from which its antennas or settings were learned. Then the series has no error.
+        SHA-256 of the logs of this series from which its antennas or settings were learned. A series with such logs is
+        not scored.
     """
 
     n_measured_out: int
@@ -192,13 +193,13 @@ class RssResult:
         ``unit`` is the unit of the measurement before the offset: ``"dBm"`` or ``"dB re full scale"``.
     time : (n,) datetime64[ns]
     measured_db, simulated_dbm : (n,)
-        Levels before the offset. NaN without a signal or path, and for poses that are unknown or too low.
+        Levels before the offset. NaN if there is no signal or path, or if the pose is unknown or too low.
     posed : (n,) bool
         True for compared samples: the pose is known and not below the lowest height.
     position_m : (n, 3)
         Position in the site frame; NaN if the pose is unknown.
     line_of_sight : (n,)
-        1 with a line of sight, 0 without, NaN without a pose.
+        1 with a line of sight, 0 without it, NaN if the pose is unknown.
     geometry : mapping of str to (n,)
         Distance [m] and angles [deg] of the link, by name with unit.
     score : RssComparison
@@ -238,7 +239,7 @@ class RssResult:
 
     @property
     def training(self) -> bool:
-        """True if the antennas were learned from the logs of this series. Such a series has no error."""
+        """True if the antennas were learned from the logs of this series. Such a series is not scored."""
         return bool(self.further.trained_on)
 
     @property
@@ -272,7 +273,7 @@ class RssResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairResult:
-    """Two channels of one tower at their common times ``time`` (n,)."""
+    """Comparison of two channels of one tower at their common times ``time`` (n,)."""
 
     tower: str
     first: str
@@ -285,16 +286,16 @@ class PairResult:
 class RankFurther:
     """Numbers of the rank of a tower other than those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
 
-    ``n_flagged`` counts samples by reason. The keys of ``foliage`` are run and K. ``commonest`` is the score of the
-    constant forecast. ``repeat`` is the agreement of the modem with itself at positions that both halves of the flight
-    visit.
+    ``n_flagged`` counts samples by reason. The keys of ``foliage`` are foliage model and K. ``commonest`` is the score
+    of the constant forecast. ``repeat`` is the agreement between the modem's reports at positions that both halves of
+    the flight visit.
 
     Parameters
     ----------
     trained_on : tuple of str, optional
         SHA-256 of the logs of this series to which the receiver was fitted. Such a series has no score.
     agreement_sd_by_ground : mapping of str to float, optional
-        Standard deviation of the agreement, by K, if the ground is varied within the errors of the known heights.
+        Standard deviation of the agreement, by K, if the ground heights are varied within their errors.
     """
 
     n_flagged: Mapping[str, int]
@@ -350,7 +351,7 @@ class RankResult:
 
     @property
     def singular_ratio_db(self) -> FloatArray:
-        """Ratios of all other singular values to the first, shape (n, m - 1) [dB]. They explain a rank."""
+        """Ratios of all other singular values to the first, shape (n, m - 1) [dB]. They determine the rank."""
         with np.errstate(invalid="ignore"):  # 0 / 0 without a channel
             return db_from_amplitude(self.sigma[:, 1:] / self.sigma[:, :1])
 
@@ -384,7 +385,7 @@ class AuditResult:
 class EngineResult:
     """The engine that replayed the flight, with its computing time, its omissions and its audit.
 
-    ``not_audited`` is the reason why Sionna RT could not audit it. It is empty after an audit.
+    ``not_audited`` is the reason why Sionna RT could not audit the engine. It is empty after an audit.
     """
 
     engine: str
@@ -402,7 +403,7 @@ class FlightVerdict:
     """The comparison of ray tracing with the best baseline ``against``, over all channels of a flight.
 
     ``difference_db`` is the RMSE of ray tracing minus that of the baseline, with one offset per channel. It is negative
-    if ray tracing is better. Levels of a receiver that lost its lock count as its floor.
+    if ray tracing is better. If a receiver lost its lock, its levels without lock count as its floor.
     """
 
     against: str
@@ -415,7 +416,7 @@ class FlightVerdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """The results of one flight. Fields are empty for series that the flight does not have.
+    """The results of one flight. A field is empty if the flight does not have such logs.
 
     ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both are empty
     if no models were compared.
@@ -423,7 +424,7 @@ class FlightResult:
     Parameters
     ----------
     verdict : FlightVerdict, optional
-        The comparison with the best baseline over all channels. None if nothing could be scored.
+        The comparison with the best baseline over all channels. None if no channel could be scored.
     likely_cause : Cause, optional
         The systematic error that explains most of the RMSE. None if none is identified.
     next_step : str, optional
@@ -448,10 +449,10 @@ class FlightResult:
 
     @property
     def clocks(self) -> dict[str, ClockResult]:
-        """One clock per receiver."""
+        """The comparison of each receiver's clock with telemetry, by receiver."""
         return {clock.receiver: clock for item in self.rss if (clock := item.further.clock) is not None}
 
     @property
     def series(self) -> tuple[RssResult | RankResult, ...]:
-        """Levels, then ranks."""
+        """All compared series: levels, then ranks."""
         return (*self.rss, *self.rank)

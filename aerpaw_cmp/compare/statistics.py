@@ -6,17 +6,17 @@ its slowest cosine terms (Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.
 are normal with a known covariance. Correlation times range from zero to three times the flight. The correlation
 functions are exponential, with and without white noise, or smooth (Matern 3/2). Correlations over position follow the
 track. Each correlation is weighted by its likelihood and by a prior weight, chosen so that 95 % intervals have
-sufficient coverage for all of them. Because the weights alone would make some intervals too wide, the draws are also
-widened or narrowed, depending on the correlations that the sequence shows. Weights and widening factors were found by
-simulation (``benchmarks/interval_weights.py``).
+sufficient coverage for every correlation. Because the weights alone would make some intervals too wide, the draws are
+also widened or narrowed, depending on which correlations the sequence supports. Weights and widening factors were found
+by simulation (``benchmarks/interval_weights.py``).
 
 Statistics of ranks and of paired models are means of contributions of the samples, so their intervals are computed in
 the same way. Comparisons over all channels of a flight also learn the correlation from each channel
 (:class:`Channels`).
 
 Passes over the same positions are compared for every pair of flights: 199 000 pairs for 200 flights with ten links. The
-positions of a flight are therefore put into one k-d tree, pairs whose boxes are apart are not searched, and
-links that were sampled together share one search.
+positions of a flight are therefore put into one k-d tree, pairs of flights whose bounding boxes do not overlap are not
+searched, and links that were sampled together share one search.
 """
 
 from __future__ import annotations
@@ -61,16 +61,16 @@ Track = FloatArray | None
 # ratio of the root of 2, because the square of a correlation is the correlation with half its length.
 LENGTHS = 0.06 * 2.0 ** (0.5 * np.arange(12))
 
-# Shares of white noise or of fading that are mixed with each correlation over place. They refer to the power of the
+# Shares of white noise or of fading that are mixed with each correlation over position, relative to the power of the
 # slow terms. Fading is correlated over a fortieth of the flight.
 PLACE_WHITE = 0.002 * 2.0 ** np.arange(9)
 PLACE_FADING = (0.1, 0.25, 0.5, 0.75)
 _FADING_RATE = 40.0
 
 # By kind: weight of a correlation over position relative to the mean weight of a correlation over time, and length
-# above which the weight falls as 1 / length. The terms hardly distinguish such lengths, but the mean and the power of a
-# test depend on them. The values were found by simulation. Differences of squares have half the correlation length of
-# errors.
+# above which the weight falls as 1 / length. The cosine terms hardly distinguish such lengths, but the mean and the
+# power of a test depend on them. The values were found by simulation. Differences of squares have half the correlation
+# length of errors.
 _PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.12, 0.2), "influence": (0.07, 1.0)}
 
 # Largest number of positions from which the correlations of a track are computed.
@@ -80,16 +80,17 @@ _THINNED = 400
 # centre of the track is below this [m]: the logged positions of a hover are noise.
 _UNPLACED, _HOVER_M = 0.1, 15.0
 
-# Part of the slow fluctuations of pooled channels that is white or ten times faster, because channels differ in their
-# correlation.
+# Part of the slow fluctuations of pooled channels that is white or ten times faster, because the correlations of
+# channels differ.
 _SECOND_PART = 0.3
 
-# Smallest rate of a correlation with white noise that channels can show. With slower ones, no term would exceed the
-# noise, but the mean would vary.
+# Smallest rate of a correlation with white noise that pooled channels can reveal. At smaller rates, no term would
+# exceed the noise, but the mean would vary.
 _VISIBLE = 6.0
 
 # Number of bins of a pooled sequence for the terms of its channels, and standard deviation of the logarithm of the
-# power of a sum of independent channels, relative to the sum of their powers. It is 0.2 for a known correlation.
+# ratio of the power of a sum of independent channels to the sum of their powers. The latter is 0.2 for a known
+# correlation.
 _BINS, _SUM_OF_POWERS = 1024, 0.3
 
 # File with logarithms of the weights in tenths, by kind, form (exponential with each white share, then smooth) and
@@ -97,18 +98,18 @@ _BINS, _SUM_OF_POWERS = 1024, 0.3
 # share.
 _TABLES = Path(__file__).with_name("memory_weights.json")
 
-# Factor of the upward standard deviation of the logarithm of the power relative to that of the fourth moment, by
-# simulation with Student's t of four degrees of freedom. Most sequences from a process with heavy tails contain fewer
-# large errors than the process.
+# Factor from the standard deviation of the log power that the fourth moment suggests to the upward standard deviation
+# that is used. It was found by simulation with Student's t of four degrees of freedom. Most sequences from a process
+# with heavy tails contain fewer large errors than the process.
 CALM = 1.8
 
 # Number of parts of a flight whose powers are compared, the multiple of the median power above which a part is loud,
-# and the smallest number of samples. On the simulated kinds of ``benchmarks/coverage_of_intervals.py``, below 1 % of
-# steady flights have two loud parts, or 4 % for 100 samples of Student's t with four degrees of freedom.
+# and the smallest number of samples. In the simulations of ``benchmarks/coverage_of_intervals.py``, fewer than 1 % of
+# steady flights have two loud parts, and 4 % of flights with 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
-# Smallest widening factor. With it, the interval contains 80 % of the draws. Without this limit, the factor could reach
-# 0 for an unusual mixture of correlations.
+# Smallest widening factor, with which the interval contains 80 % of the draws. Without this limit, the factor could
+# reach 0 for an unusual mixture of correlations.
 _LEAST_STRETCH = 0.6
 
 # Draws come in pairs of opposite sign, so that swapping two models reverses an interval exactly.
@@ -117,12 +118,13 @@ _PAIRS = 2048
 
 @dataclass(frozen=True, slots=True)
 class CorrelationSet:
-    """The normal distributions of mean and cosine terms for m correlations, up to a common scale.
+    """The normal distributions of the mean and the cosine terms of a sequence for m correlations, up to a common scale.
 
-    ``whiten`` (m, terms, terms) makes the terms independent. ``log_det`` (m,) is the logarithm of its determinant.
-    For known terms, ``slope`` (m, terms) and ``variance`` (m,) determine mean and variance of the mean of the sequence.
-    ``power`` (m,) is the power of all terms. For errors over place, ``beyond`` (m,) is their power in faster terms, and
-    ``freedom`` (m,) the number of independent squares in it. They are 0 and infinite for errors over time.
+    ``whiten`` (m, terms, terms) makes the terms independent. ``log_det`` (m,) is the logarithm of its determinant. For
+    known terms, ``slope`` (m, terms) and ``variance`` (m,) determine mean and variance of the mean of the sequence.
+    ``power`` (m,) is the power of all terms. For errors that are correlated over position, ``beyond`` (m,) is their
+    power in faster terms, and ``freedom`` (m,) the number of independent squares in that power. For errors over time,
+    these are 0 and infinity.
     """
 
     whiten: FloatArray
@@ -154,7 +156,7 @@ class CorrelationSet:
 
 @cache
 def time_correlations(terms: int = TERMS) -> CorrelationSet:
-    """Return exponential correlations with each of :data:`WHITE_SHARES`, then smooth ones, at all :data:`RATES`."""
+    """Return exponential correlations for each of :data:`WHITE_SHARES`, then smooth ones, at all :data:`RATES`."""
     white = np.eye(terms + 1)
     covariances = [
         (1.0 - share) * 0.5 * rate * _exponential(rate, terms).real + share * white
@@ -204,7 +206,7 @@ def place_correlations(place_m: Track, terms: int = TERMS, centred: bool = False
     return _place_correlations(place_m[at].tobytes(), ((at + 0.5) / len(place_m)).tobytes(), terms, centred)
 
 
-# Channels and models of a flight share its track; each entry takes 4 MB.
+# Channels and models of a flight have the same track. Each cached result takes 4 MB.
 @lru_cache(maxsize=8)
 def _place_correlations(positions: bytes, instants: bytes, terms: int, centred: bool) -> CorrelationSet:
     place, instant = np.frombuffer(positions).reshape(-1, 3), np.frombuffer(instants)
@@ -264,7 +266,7 @@ def only_time(place_m: Track) -> str:
 
 
 def _smooth(rate: float, terms: int) -> FloatArray:
-    """Return the covariance for (1 + rate |s - t|) exp(-rate |s - t|), by the derivative of the exponential one."""
+    """Return the covariance for (1 + rate |s - t|) exp(-rate |s - t|), from the derivative of :func:`_exponential`."""
     step = 1e-20  # along the imaginary axis, which is exact to rounding
     covariance = _exponential(complex(rate, rate * step), terms)
     return np.asarray(covariance.real - covariance.imag / step)
@@ -301,7 +303,7 @@ def stretches(kind: Kind) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """The cosine terms of a sequence: the slow ones (q,), and power and degrees of freedom of the fast ones."""
+    """The cosine terms of a sequence: the slow terms (q,), and power and degrees of freedom of the fast terms."""
 
     slow: FloatArray
     fast_power: float
@@ -335,7 +337,7 @@ class WeightedCorrelations:
 
 
 def weighted_correlations(kind: Kind, terms: int, place_m: Track = None) -> WeightedCorrelations:
-    """Return the correlations over time, and over place if positions (n, 3) [m] allow it, with their weights."""
+    """Return the correlations over time, and over position if the positions (n, 3) [m] allow it, with their weights."""
     over_time, weight, stretch = time_correlations(terms), weights(kind), stretches(kind)
     over_place = place_correlations(place_m, terms)
     if over_place is None:
@@ -349,7 +351,7 @@ def weighted_correlations(kind: Kind, terms: int, place_m: Track = None) -> Weig
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """The channel (n,) of each sample of a pooled sequence, and whether errors are about the mean of their channel.
+    """The channel (n,) of each sample of a pooled sequence, and whether the mean of each channel was subtracted.
 
     Channels are numbered from 0.
     """
@@ -358,14 +360,15 @@ class Channels:
     centred: bool
 
     def weighted(self, values: FloatArray, known: WeightedCorrelations, place_m: Track) -> WeightedCorrelations:
-        """Return correlations with weights for a pooled sequence (n,), from those for a single sequence.
+        """Return the correlations weighted for a pooled sequence (n,), given those weighted as for a single channel.
 
         The terms of the sequence are the sum of the terms of its channels. If channels are independent, the outer
         products of the terms of each channel add up to the covariance of the sum on average, even if the channels have
         different correlations, powers or numbers of samples. Their likelihood then counts like that of several
-        sequences, whose number follows from the powers and correlations of the channels. But channels with common
-        fading and noise of their own are not like their sum. Therefore the weights are a mixture of these likelihoods
-        and of the weights for a single sequence. The odds are low if the power of the sum is not the sum of the powers.
+        sequences, whose number follows from the powers and correlations of the channels. However, if channels have
+        common fading and separate noise, their sum is correlated in another way than each channel. Therefore the
+        weights are a mixture of these likelihoods and of the weights for a single sequence. The likelihoods of the
+        channels have a small weight if the power of the sum is not the sum of the powers.
         """
         from scipy.fft import dct
 
@@ -400,7 +403,7 @@ def likelihoods(slow: FloatArray, parts: Sequence[CorrelationSet] = ()) -> tuple
     square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
     log_det = np.concatenate([part.log_det for part in parts])
     log = log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
-    # relative to the largest, because likelihoods exceed the range of floats
+    # relative to the largest likelihood, because likelihoods exceed the range of floats
     return np.exp(log - log.max(axis=-1, keepdims=True)), square
 
 
@@ -453,7 +456,7 @@ def memory_share(values: FloatArray) -> float:
 def mean_draws(
     values: FloatArray, kind: Kind = "mean", place_m: Track = None, of: Channels | None = None
 ) -> FloatArray:
-    """Return draws of the mean of the process minus the mean of the sequence.
+    """Return random draws of the mean of the process minus the mean of the sequence.
 
     Parameters
     ----------
@@ -495,7 +498,8 @@ def heavy_tails(values: FloatArray) -> float:
     square = max((np.square(e) for e in both), key=lambda e: float(e @ e) / max(float(e.mean()) ** 2, 1e-300))
     # Subtract part of the standard error, because a short normal sequence can show heavy tails by chance.
     excess = float(square @ square) / n / max(float(square.mean()) ** 2, 1e-300) - 3.0 - np.sqrt(6.0 / n)
-    # A long sequence contains the rare large errors that are missing in a short one. Found by simulation, like CALM.
+    # A long sequence contains rare large errors that a short sequence lacks. The power was found by simulation, like
+    # CALM.
     return float(np.sqrt(max(excess, 0.0) / n) * (300.0 / n) ** 0.1)
 
 
@@ -505,9 +509,9 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
     Returns
     -------
     share, ratio : float
-        Share of the samples in the loud parts, and their mean square divided by that of the others. 0 and 1 if the
-        sequence is steady. At least two parts must be loud by the innovations of a second-order autoregression, which
-        are hardly correlated, and by their own mean square.
+        Share of the samples in the loud parts, and the mean square of these samples divided by that of all others. 0
+        and 1 if the sequence is steady. At least two parts must be loud by the innovations of a second-order
+        autoregression, which are hardly correlated, and by their own mean square.
     """
     away = values - values.mean()
     if len(away) < _FEWEST_FOR_PARTS or not away.any():
@@ -527,7 +531,8 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
 def power_draws(values: FloatArray, place_m: Track = None) -> FloatArray:
     """Return draws of the expected variance of sequences with this length and spacing.
 
-    Draws have the order of :func:`mean_draws`. A correlation longer than the sequence affects only its mean.
+    The draws are in the same order as in :func:`mean_draws`. A correlation longer than the sequence affects only its
+    mean.
 
     Parameters
     ----------
@@ -549,7 +554,7 @@ def power_draws(values: FloatArray, place_m: Track = None) -> FloatArray:
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     share, ratio = loud_part(values)
-    # reduce the effect of heavy tails, because a loud part also makes tails heavy and is included below
+    # reduce the effect of heavy tails, because a loud part, which is included below, also makes tails heavy
     heavy = (0.7 if share else 1.0) * heavy_tails(values)
     tails = np.exp(heavy * np.where(normal > 0.0, CALM, 1.0) * normal)
     drawn = (scale * known.joined("power")[index] + fast) * tails
@@ -566,11 +571,11 @@ _NORMAL_95 = 1.959964
 # Width of an interval relative to its value above which only its lower end is reported.
 _BOUND = 2.0
 
-# Number of segments of a flight. The regression coefficient in each comes from all other segments.
+# Number of segments of a flight. The regression coefficient for a segment is fitted to all other segments.
 _SEGMENTS = 24
 
-# Nominal share of flights with a false verdict on any channel. With a nominal share of 0.05, 1 to 10 % of
-# simulated flights have one, because small probabilities are estimated less accurately than the ends of an interval.
+# Nominal share of flights with a false verdict on any channel. With a nominal share of 0.05, 1 to 10 % of simulated
+# flights have a false verdict, because small probabilities are estimated less accurately than the ends of an interval.
 _FAMILY = 0.02
 
 Interval = tuple[float, float]
@@ -583,7 +588,7 @@ def independent_samples(values: FloatArray, place_m: Track = None) -> float:
     Parameters
     ----------
     values : (n,)
-        In time order, without NaN.
+        Values in time order, without NaN.
     place_m : (n, 3), optional
         The same as in :func:`mean_draws`.
 
@@ -598,14 +603,14 @@ def independent_samples(values: FloatArray, place_m: Track = None) -> float:
 
 
 def _independent(values: FloatArray, interval: Interval) -> float:
-    """Return the number of independent samples whose mean would have this 95 % interval."""
+    """Return the number of independent samples that would determine the mean with this 95 % interval."""
     half = 0.5 * float(np.ptp(interval))
     return float(np.clip(_NORMAL_95**2 * values.var() / half**2, 1.0, len(values))) if half else float(len(values))
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorIntervals:
-    """The 95 % intervals of one measured and simulated sequence of levels.
+    """The 95 % intervals for the comparison of a measured with a simulated sequence of levels.
 
     Parameters
     ----------
@@ -625,7 +630,7 @@ class ErrorIntervals:
 
 
 def error_intervals(measured_db: FloatArray, simulated_db: FloatArray, place_m: Track = None) -> ErrorIntervals:
-    """Compute the intervals of offset (mean difference), RMSE about it, and correlation of the process of a flight.
+    """Compute the intervals of offset (mean difference), RMSE with this offset, and correlation.
 
     Parameters
     ----------
@@ -665,7 +670,7 @@ def _notes(values: FloatArray, place_m: Track) -> Iterator[str]:
 
 
 def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, place_m: Track) -> Interval:
-    """Return the interval of the correlation for a fixed route: slope and rest of the measurement are random."""
+    """Return the interval of the correlation for a fixed route: slope and residual of the measurement are random."""
     s, m = simulated_db - simulated_db.mean(), measured_db - measured_db.mean()
     spread = float(s @ s) / len(s)
     if spread == 0.0 or not m.any():
@@ -677,7 +682,7 @@ def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, pla
 
 
 def mean_interval(values: FloatArray, place_m: Track = None) -> Interval:
-    """Return the 95 % interval of the mean of the process that a sequence (n,) in time order comes from.
+    """Return the 95 % interval of the mean of the process of which a sequence (n,) in time order is a sample.
 
     Errors may be correlated over the positions ``place_m`` (n, 3) [m] as well, as for :func:`mean_draws`.
     """
@@ -736,7 +741,8 @@ def rmse_interval(residual: FloatArray, rmse: float, place_m: Track = None) -> I
     """Return the 95 % interval of the root mean square of residuals (n,) in time order, whose value is ``rmse``.
 
     The residuals have a mean if the offset is on a grid, at the edge of its range or fitted with a floor. The mean
-    changes both ends like the RMSE. Positions ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
+    shifts both ends of the interval as it shifts the RMSE. Positions ``place_m`` (n, 3) [m] are used as by
+    :func:`mean_draws`.
     """
     if len(residual) < FEWEST:
         return NO_INTERVAL
@@ -757,12 +763,12 @@ def middle_span(values: FloatArray) -> float:
     return float(np.ptp(np.percentile(values, (10, 90))))
 
 
-# A level that spans less than this share of the predicted ones is flat: a noise floor or an input without signal.
+# A level is flat if it varies less than this share of the predicted levels: a noise floor, or an input without signal.
 _FLAT = 0.2
 
 
 def is_flat(measured_db: FloatArray, predicted_db: Iterable[FloatArray]) -> bool:
-    """Check whether a level (n,), n > 0, hardly varies although every prediction (n,) varies [dB]."""
+    """Check whether a level (n,), n > 0, hardly varies although every predicted level (n,) varies [dB]."""
     return middle_span(measured_db) < _FLAT * min(map(middle_span, predicted_db))
 
 
@@ -772,7 +778,7 @@ def is_stuck(level_db: FloatArray) -> bool:
 
 
 def correlation(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the Pearson correlation over pairs without NaN. NaN for a constant side or fewer than three pairs."""
+    """Return the Pearson correlation over pairs without NaN. NaN for fewer than three pairs or a constant side."""
     a, b = unmasked(first), unmasked(second)
     ok = np.isfinite(a) & np.isfinite(b)
     if ok.sum() < 3 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
@@ -794,16 +800,16 @@ class PairedDifference:
     difference_db : float
         ``rmse_db - other_rmse_db`` [dB], negative if the first model is better.
     difference_ci95_db : (low, high)
-        95 % interval of the difference [dB]. NaN if there is none, or if it contains 0 and would make an error
-        negative: the flight is then too short for its correlation.
+        95 % interval of the difference [dB]. NaN if there is no interval. Also NaN if it contains 0 and would make an
+        error negative, because the flight is then too short for its correlation.
     standard_error_db : float
         Half of the central 68 % interval of ``difference_db`` [dB], NaN if there is none.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
         Difference of the mean square errors and its interval [dB^2].
     p_value : float
-        Probability of a difference as large between equally good models.
+        Probability that equally good models differ by at least this much.
     verdict : {"better", "worse", "not significant", "no interval"}
-        Verdict of the interval on the first model.
+        Verdict on the first model, according to the interval.
     """
 
     n: int
@@ -856,7 +862,7 @@ def paired_difference(
     place_m : (n, 3), optional
         The same as in :func:`mean_draws`.
     of : Channels, optional
-        Channels of all samples, if those of several channels are compared at once. Then no sample is NaN.
+        Channel of each sample, if samples of several channels are compared at once. No sample may be NaN then.
 
     Returns
     -------
@@ -879,7 +885,7 @@ def paired_difference(
     first, second = first[finite], second[finite]
     if free_offset and len(first):
         first, second = first - first.mean(), second - second.mean()
-    # a copy of a model differs by rounding, which must not decide
+    # treat models that differ only by rounding as equal
     second = np.where(np.abs(first - second) < _ROUNDING_DB, first, second)
     nan = float("nan")
     square, other_square = (float(np.mean(e * e)) if len(e) else nan for e in (first, second))
@@ -915,7 +921,7 @@ def undecided(first: FloatArray, second: FloatArray) -> FloatArray:
     apart = first - second
     segment = np.arange(len(apart)) * _SEGMENTS // len(apart)
     products, squares = (np.bincount(segment, values, _SEGMENTS) for values in (first * apart, apart * apart))
-    # a small weight towards equal models, which decides if one segment contains all of the difference
+    # add a small weight towards equal models, for a flight in which one segment contains all of the difference
     even = 1e-3 * squares.sum() + 1e-300
     share = (products.sum() - products + 0.5 * even) / (squares.sum() - squares + even)
     return np.asarray(2.0 * (first - share[segment] * apart) * apart)
@@ -963,7 +969,7 @@ def pooled_difference(
 def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | None = None) -> list[PairedDifference]:
     """Correct the verdicts of several channels for their number (Holm 1979).
 
-    With a probability of 95 %, all remaining verdicts are right.
+    With a probability of 95 %, all verdicts that remain are right.
 
     Channels with the same ``measured`` levels count once.
     """
@@ -1008,8 +1014,9 @@ def share_interval(indicator: FloatArray, place_m: Track = None, sequence: Float
 
     Notes
     -----
-    Wilson's interval for the number of independent samples whose mean would be equally accurate. It has a positive
-    width even at shares of 0 and 1, where the samples do not vary. Wilson (1927), doi:10.1080/01621459.1927.10502953.
+    This is Wilson's interval for the number of independent samples whose mean would be equally accurate. It has a
+    positive width even at shares of 0 and 1, where the samples do not vary. Wilson (1927),
+    doi:10.1080/01621459.1927.10502953.
     """
     n = len(indicator)
     if n < FEWEST:
@@ -1033,7 +1040,7 @@ _HEADING_WITHIN_DEG = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """One pass: positions (n, 3) [m], values (n,), NaN if missing, and optional headings (n,) [deg]."""
+    """One pass over positions (n, 3) [m], with values (n,), NaN if missing, and optional headings (n,) [deg]."""
 
     position_m: FloatArray
     value: FloatArray
@@ -1054,7 +1061,7 @@ class Pass:
     Parameters
     ----------
     flight, tower, channel : str
-        Names. Passes of one tower and channel and of two flights are compared.
+        Names. Two passes are compared if they have the same tower and channel, and different flights.
     position_m : ndarray, (n, 3)
         East, north, up. Rows with NaN have no partner.
     level_db, residual_db : ndarray, (n,)
@@ -1083,7 +1090,7 @@ class PassPair:
     share : float
         ``n`` divided by the number of samples of the first flight.
     rmse_db, offset_db : float
-        Standard deviation and mean of second minus first measurement [dB], NaN without a pair.
+        Standard deviation and mean of second minus first measurement [dB]. NaN if there are no pairs.
     rmse_ci95_db : (low, high)
         95 % interval of the RMSE (:func:`spread_interval`), with correlation over time alone.
     single_db : float
@@ -1118,7 +1125,7 @@ class PassPair:
 
 
 class _Places:
-    """The samples that ``good`` (n,) selects, their tree and their box. ``where`` are their indices in the pass."""
+    """The samples that ``good`` (n,) selects, with k-d tree and box. ``where`` are their indices in the pass."""
 
     def __init__(self, position_m: FloatArray, heading_deg: FloatArray | None, good: BoolArray) -> None:
         self.where = np.flatnonzero(good)
@@ -1134,7 +1141,7 @@ class _Places:
         return cKDTree(self.position_m)
 
     def partners(self, other: _Places, radius_m: float, within_deg: float | None) -> tuple[IntArray, IntArray]:
-        """Return indices, in both passes, of samples and the nearest ones of the other pass with the same heading."""
+        """Return indices in both passes: samples, and the nearest samples of the other pass with a similar heading."""
         # only samples in the box of the other pass can pair, which excludes most flights of a campaign
         near = np.flatnonzero(
             ((self.position_m >= other.low - radius_m) & (self.position_m <= other.high + radius_m)).all(axis=1)
@@ -1154,7 +1161,7 @@ class _Places:
 
 @dataclass(frozen=True, slots=True)
 class _Prepared:
-    """A pass ready to be paired: positions of its levels and residuals, numbers of its cells, and means."""
+    """A pass that is prepared for pairing: positions of its levels and residuals, numbers of its cells, and means."""
 
     number: int
     flown: Pass
@@ -1177,7 +1184,8 @@ def pass_pairs(
     cell_m : float
         Side of the square cells on the map [m].
     radius_m : float
-        A sample of the first pass is paired with the nearest sample of the second pass within this distance.
+        Largest distance from a sample of the first pass to the nearest sample of the second pass, with which it is
+        paired.
     heading_within_deg : float, optional
         Largest difference of the headings of a pair, if both passes have headings. None allows any heading.
 
@@ -1221,7 +1229,7 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
 
 
 def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> _Places:
-    """Return the positions of some samples, the same object for links that were sampled together."""
+    """Return the positions of some samples. Links that were sampled together share one object."""
     columns = (good, flown.position_m, *([] if flown.heading_deg is None else [flown.heading_deg]))
     # compare contents, because links that were sampled together have equal positions in different arrays
     key = hashlib.sha256(b"".join(column.tobytes() for column in columns)).digest()
@@ -1249,10 +1257,10 @@ def cell_means(
     residual_db, height_m : (c,)
         Means over the samples of each cell.
     """
-    # horizontal cells, so that passes at different heights share them
+    # use horizontal cells, so that passes at different heights have common cells
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
     cell, which = np.unique(cells, axis=0, return_inverse=True)
-    # NumPy 2.0 returns two dimensions
+    # NumPy 2.0.0 returns an array of two dimensions here
     which = which.reshape(-1)
     count = np.maximum(np.bincount(which, minlength=len(cell)), 1)
     residual = np.bincount(which, weights=residual_db[good], minlength=len(cell)) / count
@@ -1261,7 +1269,7 @@ def cell_means(
 
 
 def _pair(mine: _Prepared, theirs: _Prepared, met: Callable[[_Places, _Places], tuple[IntArray, IntArray]]) -> PassPair:
-    """Compare two passes of a link. ``met`` finds the indices of partners."""
+    """Compare two passes of a link. ``met`` is the function that finds the indices of partners."""
     i, j = met(mine.level, theirs.level)
     level = theirs.flown.level_db[j] - mine.flown.level_db[i]
     i, j = met(mine.residual, theirs.residual)

@@ -47,7 +47,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return channels with an offset and enough samples, without copies and (if any has a signal) dead channels."""
+    """Return channels with an offset and enough samples, without copies. If any has a signal, omit those without."""
     some = [p for p in without_copies(panels) if not p.score.at_edge]
     enough = [p for p in some if p.score.n >= statistics.FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
@@ -58,7 +58,7 @@ def without_copies(panels: Iterable[RssResult]) -> list[RssResult]:
     return list({panel.measured_db.tobytes(): panel for panel in reversed(list(panels))}.values())[::-1]
 
 
-# Because of fading, a received level varies by more than this [dB], even at one position.
+# Because of fading, the level of a received signal varies by more than this [dB], even at one position.
 _DEAD_DB = 1.0
 
 
@@ -97,15 +97,15 @@ def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
 
 
 def lock_lost(panel: RssResult) -> DetectionScore | None:
-    """Return the detection score of a receiver whose log shows lost lock, or None for other receivers."""
+    """Return the detection score of a receiver that lost its lock according to the log, or None for other receivers."""
     score = panel.further.detection
     return score if score is not None and score.locks else None
 
 
 def flight_verdict(panels: Sequence[RssResult]) -> FlightVerdict | None:
-    """Compare ray tracing with the baseline of the smallest error, over all scored channels at once.
+    """Compare ray tracing with the baseline that has the smallest error, over all scored channels at once.
 
-    For a receiver that lost its lock, all samples are used, with lower levels raised to its floor.
+    For a receiver that lost its lock, all samples are used, and levels below its floor are raised to the floor.
     """
     panels = scored(panels)
     residuals = [_residuals(panel) for panel in panels]
@@ -156,7 +156,7 @@ RankingVerdict = Literal["first", "worse", "not significant", "no interval"]
 
 
 def left_out_offsets(n: ArrayLike, mean_db: ArrayLike, *, span_db: tuple[float, float] = SPAN_DB) -> FloatArray:
-    """Compute the offset [dB] of each flight from the samples of all others.
+    """Compute the offset [dB] of each flight from the samples of all other flights.
 
     Parameters
     ----------
@@ -287,12 +287,12 @@ NONE = "none"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """A decision.
+    """A verdict, as in the first sentences of a page.
 
     Parameters
     ----------
     cause : str
-        Key of the sentence and action, ``none`` if no cause is significant.
+        Key of the sentence and of the next step, ``none`` if no cause is significant.
     effect : float
         Effect in the unit of the cause (dB, a ratio, a share), NaN if there is none.
     interval : (low, high)
@@ -336,9 +336,9 @@ def campaign_verdict(
 
     Notes
     -----
-    Each candidate splits the flights in two, and is tested by a two-sample t test with pooled variance. For one flight
-    this is the test of the externally Studentised residual. The smallest p-value is multiplied by the number of
-    candidates (Bonferroni).
+    Each candidate splits the flights in two, and is tested by a two-sample t test with pooled variance. If one side has
+    a single flight, this is the test of the externally Studentised residual. The smallest p-value is multiplied by the
+    number of candidates (Bonferroni).
     """
     shifts = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift[0])]
     chance, best = min(shifts, key=lambda shift: shift[0], default=(1.0, Verdict()))
@@ -361,7 +361,7 @@ def _shifts(
         values = np.array([of[name] for name in flown_here])
         for name, value in zip(flown_here, values - values.mean() if len(flown_here) else values, strict=True):
             about.setdefault(name, []).append(float(value))
-        # at least two flights on either side, because a single flight is an outlier and not a step
+        # require two flights on either side, because a single flight is an outlier and not a step
         for k in range(2, len(flown_here) - 1):
             chance, effect, ends = _split(values, np.arange(len(flown_here)) >= k)
             where = f"{link} from {flown_here[k]}"
@@ -412,7 +412,7 @@ def by_flight(
     -------
     Verdict
         ``better``, ``worse``, ``not significant`` or ``no interval`` for the first model. Effect: mean over flights of
-        the first minus the second [dB], with an interval from :data:`FEWEST_FLIGHTS` flights on.
+        the first minus the second [dB], with an interval if there are at least :data:`FEWEST_FLIGHTS` flights.
     """
     first, second = _means(errors_db), _means(other_db)
     mean = mean_of_flights([first[name] - second[name] for name in first if name in second])
@@ -441,7 +441,8 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
     -------
     Verdict
         ``antenna`` if each wrong frame is significantly worse, ``place`` if one is significantly better, ``no
-        interval`` for too few flights, else ``not separable``. Effect and interval are those of the nearest frame.
+        interval`` for too few flights, else ``not separable``. Effect and interval are those of the wrong frame with
+        the most similar error.
     """
     known = [item for item in against if math.isfinite(item.effect)]
     if not known:
@@ -459,11 +460,11 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
 
 # --- prediction -----------------------------------------------------------------------------------------------------
 
-# Ratio of the 99 % to the 95 % interval of a normal distribution. Bias and spread are two tests, so the wider interval
-# is used for the bias.
+# Ratio of the 99 % to the 95 % interval of a normal distribution. Bias and standard deviation are two tests, so the
+# wider interval is used for the bias.
 _TWO_TRIED = 1.3
 
-# Errors agree with their stated standard deviation if the ratio is between the inverse of this number and this number.
+# Errors agree with their stated standard deviation if the ratio of both is between 1 / this number and this number.
 _LEAST_RATIO = 1.15
 
 
@@ -473,12 +474,12 @@ def stated_errors(
     common_db: FloatArray | float = 0.0,
     place_m: FloatArray | None = None,
 ) -> Verdict:
-    """Check whether errors are as large as was stated for them.
+    """Check whether errors agree with the standard deviations that were stated for them.
 
     Parameters
     ----------
     error_db, sd_db : (n,)
-        Measured minus predicted, and the standard deviation stated for it, in time order [dB].
+        Measured minus predicted level, and its stated standard deviation, in time order [dB].
     common_db : float or (n,)
         Part of that standard deviation that is common to a flight (an offset) [dB].
     place_m : (n, 3), optional
@@ -487,8 +488,8 @@ def stated_errors(
     Returns
     -------
     Verdict
-        ``narrow`` or ``wide`` (effect: ratio of errors to stated), ``biased`` (effect: mean error [dB]), else ``none``
-        with the ratio and its interval. ``no interval`` for fewer than 20 samples.
+        ``narrow`` or ``wide`` (effect: ratio of actual to stated errors), ``biased`` (effect: mean error [dB]), else
+        ``none`` with the ratio and its interval. ``no interval`` for fewer than 20 samples.
     """
     good = np.isfinite(error_db) & np.isfinite(sd_db) & (sd_db > 0.0)
     error, sd, place = error_db[good], sd_db[good], None if place_m is None else place_m[good]
@@ -500,8 +501,8 @@ def stated_errors(
     bias = Verdict(cause="biased", effect=mean, interval=(mean - reach, mean + reach))
     ratio = error / sd
     low, high = statistics.spread_interval(ratio, place)
-    # An error that is common to the flight does not spread the errors within it. It can hide that an interval is too
-    # narrow, but cannot make it look too wide.
+    # An error that is common to the whole flight does not contribute to the standard deviation within the flight. It
+    # can hide that an interval is too narrow, but cannot make it look too wide.
     allowed = share / float(np.mean(sd**2))
     effect, within = float(np.sqrt(np.mean(ratio**2))), float(ratio.std())
     spread = Verdict(effect=effect, interval=(low, max(effect, math.sqrt(high**2 + allowed))))
@@ -516,7 +517,7 @@ def stated_errors(
 
 # --- map ------------------------------------------------------------------------------------------------------------
 
-# A sentence explains the gaps of a map if the share of positions in coverage is smaller than this.
+# If the share of positions in coverage is smaller than this, a sentence explains the gaps of the map.
 _COVERED = 0.95
 
 
@@ -524,8 +525,9 @@ _COVERED = 0.95
 class Coverage:
     """The coverage of a map at one height, as shares of its positions.
 
-    ``covered`` is the share with the trees as mapped, ``clear`` without trees (NaN if not mapped). ``reached`` is the
-    share with a path of any level, and ``outside`` the share farther from every flight than a correction reaches.
+    ``covered`` is the share with the trees of the site, ``clear`` the share without trees (NaN if not computed).
+    ``reached`` is the share with a path of any level, and ``outside`` the share farther from every flight than a
+    correction reaches.
     """
 
     height_m: float
@@ -567,8 +569,8 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
 
 # Number of latest nights that are tested for a step, and nominal probability of a false step per night over all nodes.
 # Seven nights show smaller steps than one night. The true probability is 1 % per night, even if consecutive nights
-# correlate by 0.7, and half of that at 0.5 (``python -m tests.compare.test_steps 500``). It exceeds the nominal
-# probability, because a robust fit with missing links has longer tails than Student's t.
+# correlate by 0.7, and half of that if they correlate by 0.5 (``python -m tests.compare.test_steps 500``). It exceeds
+# the nominal probability, because a robust fit with missing links has longer tails than Student's t.
 _CHANCES = {1: 0.0025, 7: 0.0005}
 
 # Smallest number of nights that determine the standard deviation well enough to test for a step.
@@ -581,9 +583,9 @@ _HUBER = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """A change of an offset: its first night, the night after which it was found, and its size with 95 % interval.
+    """A step of an offset: its first night, the night after which it was found, and its size with a 95 % interval.
 
-    ``back`` is the night at which the old level returned, if that was after one or two nights, else empty.
+    ``back`` is the night at which the old level returned, if it did so after one or two nights, else empty.
     """
 
     night: str
@@ -595,9 +597,9 @@ class Step:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeOffset:
-    """The offset of one end of links over the nights of a campaign [dB], relative to its median.
+    """The offset of one transmitter or receiver over the nights of a campaign [dB], relative to its median.
 
-    ``sd_db`` is its standard deviation between steps, and ``smallest_db`` is the step that is found in the same night
+    ``sd_db`` is the standard deviation between steps, and ``smallest_db`` is the step that is found in the same night
     with a probability of 90 %. Both are NaN if there are too few nights.
     """
 
@@ -611,7 +613,7 @@ class NodeOffset:
 
 @dataclass(frozen=True, slots=True)
 class NightOffsets:
-    """The offsets (nights,) of one end of links [dB], NaN if unknown, and the number of links (nights,) per night.
+    """The offsets (nights,) of one transmitter or receiver [dB], NaN if unknown, and its number of links per night.
 
     The variance of an offset is inversely proportional to its number of links.
     """
@@ -621,7 +623,7 @@ class NightOffsets:
 
 
 def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict[str, NightOffsets]:
-    """Compute the offset of every transmitter and receiver from those of the links between them.
+    """Compute the offset of every transmitter and receiver from the offsets of the links between them.
 
     Parameters
     ----------
@@ -637,9 +639,9 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
     Notes
     -----
     ``offset(night, link) = link + transmitter(night) + receiver(night)`` by least squares with Huber's weights. The
-    constant of a link is the median of its residuals, fitted iteratively. The plain median of its offsets would depend
-    on missing nights before or after a step. The common part of all transmitters or receivers (such as weather) is the
-    median of the other nodes. It is subtracted if there are four or more nodes.
+    constant of a link is the median of its residuals, fitted iteratively. The plain median of the link's offsets would
+    depend on missing nights before or after a step. The common part of all transmitters or receivers (such as weather)
+    is the median of the other nodes. It is subtracted if there are four or more nodes.
 
     Examples
     --------
@@ -670,7 +672,7 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
     alone = fitted.copy()
     for i, (end, _) in enumerate(columns):
         others = [j for j, of in enumerate(columns) if of[0] == end and j != i]
-        if len(others) > 2:  # with fewer, the step of one node would appear in the others
+        if len(others) > 2:  # with fewer nodes, a step of one node would appear in the others
             fitted[:, i] -= _median(alone[:, others], 1)[:, 0]
     return {
         f"{name} {('transmits', 'receives')[end]}": NightOffsets(fitted[:, i], number[:, i])
@@ -681,13 +683,13 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
 def _median(values: FloatArray, axis: int) -> FloatArray:
     """Return the median of the known values along an axis, whose length becomes 1. NaN without known values."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a link without a night, a night without a link
+        warnings.simplefilter("ignore", RuntimeWarning)  # all values of a link or of a night may be NaN
         return np.asarray(np.nanmedian(values, axis=axis, keepdims=True))
 
 
 @dataclass(slots=True)
 class _Segment:
-    """The latest nights without a step, with sum of squares and degrees of freedom of the segments before them.
+    """The latest nights without a step, with sum of squares and degrees of freedom of the earlier segments.
 
     ``values`` has a row per night: offset [dB] and weight, which is the number of links.
     """
@@ -727,7 +729,8 @@ class _Segment:
         inflation = self.inflation()
         (before, weight), (after, weight_after) = self.level(), _mean(nights)
         # The level before the step is also a mean of consecutive nights. One or two nights count as independent,
-        # because they are too few to show a correlation, and because the end of rain must be found.
+        # because they are too few to show a correlation, and because a change that ends soon, such as rain, must be
+        # found.
         level = (inflation if len(self.values) > 2 else 1.0) / weight
         share = (inflation if len(nights) > 1 else 1.0) / weight_after + level
         error = float(np.sqrt(max(square, 1e-12) / freedom * share))
@@ -751,7 +754,7 @@ def _split_nights(segment: _Segment, window: int) -> tuple[_Segment, list[tuple[
 
 
 def _between(segment: _Segment, window: int) -> float:
-    """Return the sum of squares that a step before the last ``window`` nights explains."""
+    """Return the sum of squares that is explained by a step before the last ``window`` nights."""
     earlier, nights = _split_nights(segment, window)
     (before, weight), (after, weight_after) = earlier.level(), _mean(nights)
     return (after - before) ** 2 * weight * weight_after / (weight + weight_after)
@@ -763,7 +766,7 @@ def _mean(nights: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) -> NodeOffset:
-    """Find the steps of one node's offset, night by night. Each step is found from the nights before it only.
+    """Find the steps of one node's offset, night by night, without using nights after the one that is tested.
 
     Parameters
     ----------
@@ -771,7 +774,7 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
     night : sequence of str
     offsets : NightOffsets
     nodes : int
-        Number of nodes that are tested together. All nodes together have one false step in a hundred nights.
+        Number of nodes that are tested together. There is one false step in a hundred nights over all nodes together.
 
     Returns
     -------
@@ -788,7 +791,8 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
                 continue
             if _split_nights(here, window)[0].step_to(here.values[-window:])[2] >= chance / nodes:
                 continue
-            # Find the night of the step by least squares, because nights before the step would make it look too small.
+            # Find the first night of the step by least squares, because a window with earlier nights would make the
+            # step look too small.
             window = max(range(1, min(max(_CHANCES), len(here.values) - 1) + 1), key=lambda n: _between(here, n))
             earlier, nights = _split_nights(here, window)
             step, reach, _ = earlier.step_to(nights)
@@ -823,7 +827,7 @@ class Changed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overlap:
-    """The number of samples of the first report, of the second, and of both."""
+    """The number of samples of the first report, of the second report, and of both."""
 
     first: int
     second: int
@@ -859,8 +863,8 @@ class LevelDifference:
     offset_db : Changed
         Fitted offset, as in the reports.
     rmse : PairedDifference
-        Difference on common scored samples, with the best offset of each report on them. The first model of the record
-        is the second report.
+        Difference on common scored samples, after the best offset of each report for these samples. ``rmse_db`` is that
+        of the second report, ``other_rmse_db`` that of the first.
     """
 
     tower: str
@@ -878,7 +882,7 @@ class LevelDifference:
 class RankDifference:
     """The difference in the rank of one tower at one K.
 
-    On common samples, ``n_changed`` simulated and ``n_reported_changed`` reported ranks differ.
+    ``n_changed`` simulated and ``n_reported_changed`` reported ranks of common samples differ.
     """
 
     tower: str
@@ -908,11 +912,12 @@ def level_difference(
     tower, channel : str
     samples : Overlap
     first, second : tuple of three (n,)
-        Level measured (without offset), replayed, and residual of each report on the common samples in time order [dB].
+        Measured level (without offset), simulated level and residual in each report, for the common samples in time
+        order [dB].
     scored : (int, int)
         Number of samples with a residual in each complete report.
     offsets_db : (float, float)
-        Fitted offset of each [dB].
+        Fitted offset in each report [dB].
     place_m : (n, 3), optional
         Positions of the common samples [m], NaN if unknown. With positions, the interval also allows for correlation
         over position.
@@ -941,7 +946,7 @@ def level_difference(
 
 
 def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the differences of samples with both values."""
+    """Return the differences at samples that have both values."""
     finite = np.isfinite(first) & np.isfinite(second)
     return np.asarray(second[finite] - first[finite], dtype=np.float64)
 

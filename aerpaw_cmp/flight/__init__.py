@@ -1,1 +1,1 @@
-"""A checked flight.yaml, its logs as series, pose and clock."""
+"""A flight: its checked flight.yaml, its logs as series, its poses and its clocks."""

@@ -1,8 +1,8 @@
 """Clocks of a flight: radio clock against telemetry clock, steps of full hours, and relative times.
 
-The lag between radio clock and telemetry clock follows from the likelihood of the residuals of a flight.
+The lag between radio clock and telemetry clock is estimated from the likelihood of the residuals of a flight.
 
-There is one sign convention: ``radio_minus_telemetry_s`` is positive if the radio clock shows a later time. Radio times
+The sign convention is that ``radio_minus_telemetry_s`` is positive if the radio clock shows a later time. Radio times
 are corrected by subtracting it.
 
 A clock that is wrong by full hours is recognised because the logs overlap only after a shift of that many hours.
@@ -48,7 +48,7 @@ _APART_NAT = 12.0
 # Accuracy of the time stamps of autopilots and loggers [s]. The interval is widened by this value on each side.
 STAMPS_S = 0.25
 
-# First and last spacing of the lags, and the largest number of lags that are refined.
+# First and last spacing of the lags [s], and the largest number of lags that are refined.
 _STEP_S, _FINEST_S, _MOST_FINE = 0.5, 0.02, 40
 # Largest number of means of the level per channel. Each mean covers one second or more.
 _BINS = 900
@@ -58,10 +58,11 @@ _PER_BIN = 8
 
 # Correlation lengths of the gains of tower and UAV over direction, as chords of the unit sphere.
 _CHORDS = ((0.2, 0.4, 0.8), (0.2, 0.45, 0.9))
-# Largest number of features per gain, and the share of its variance that they may miss.
+# Largest number of features per gain, and the share of the gain's variance that the features may miss.
 _FEATURES, _LEFT = 64, 0.01
 
-# Prior standard deviation of offset and slope, relative to that of the residual: so large that the data decide.
+# Prior standard deviation of offset and slope, relative to that of the residual. It is so large that only the data
+# matter.
 _FREE = 1e3
 
 _MEMORY_S = (2.0, 5.0, 15.0, 40.0)
@@ -69,19 +70,19 @@ _WHITE = (0.1, 0.3, 0.9)
 # Candidate standard deviations for :class:`_Parts`.
 _GAIN = (0.05, 0.5, 1.0, 2.0)
 
-# The flight is divided into this number of parts. With any two neighbouring parts removed, a shift must still be more
-# likely than no shift by this value [nat]: one dip, one jump of the position or a frozen track must not shift a clock.
+# The flight is divided into this number of parts. Without any two neighbouring parts, a shift must still be more likely
+# than no shift by this value [nat]: a single dip, a jump of the position or a frozen track must not shift a clock.
 _LEFT_OUT, _WITHOUT_NAT = 10, 2.0
 
 # Means are limited to this number of robust standard deviations from the median of this number of neighbours.
 _LONE, _NEIGHBOURS = 4.0, 9
 
-# Number of lags that are evaluated together, which limits the memory.
+# Number of lags that are evaluated together. It limits the memory that is used.
 _AT_ONCE = 16
 
 
 class _Parts(NamedTuple):
-    """The correlation time [s] of a residual, and the SDs of white part and gains relative to its correlated part."""
+    """The correlation time [s] of a residual, and SDs relative to its correlated part: white part and gains."""
 
     memory_s: float
     white: float
@@ -127,7 +128,7 @@ class Along:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockChannel:
-    """One channel of a receiver: levels (n,) [dB] at radio times (n,) [s], and their predictors."""
+    """One channel of a receiver: levels (n,) [dB] at radio times (n,) [s], and the predictors of the levels."""
 
     name: str
     time_s: FloatArray
@@ -161,9 +162,9 @@ class ClockEstimate:
     model : str
         Prediction that explains the level best.
     channels_s : mapping of str to float
-        Estimates of single channels.
+        Estimates from single channels.
     n : int
-        Number of means of the level.
+        Number of means of the level that were used.
     against_zero_nat : float
         Log likelihood of the best lag minus that of the best lag within :data:`_SAME_S`.
     """
@@ -180,7 +181,7 @@ class ClockEstimate:
 
     @property
     def correction_s(self) -> float:
-        """The lag to subtract from radio times: the estimate if it differs significantly from zero, otherwise 0."""
+        """The lag to subtract from radio times [s]: the estimate if it differs significantly from zero, otherwise 0."""
         low, high = self.ci95_s
         return 0.0 if self.verdict == CANNOT_TELL or low <= 0.0 <= high else self.radio_minus_telemetry_s
 
@@ -206,7 +207,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     Parameters
     ----------
     channels : sequence of ClockChannel
-        One or more channels. Only models that all of them have are used.
+        One or more channels. Only models that all channels have are used.
     window_s : float
         Largest lag on each side [s].
 
@@ -223,8 +224,8 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     The correlation time, the white share and the gains maximise the likelihood on a small grid, per channel, at lag 0
     or at the most likely lag of a model. For each lag, the model with the highest likelihood counts. A poor model
     therefore cannot exclude a lag. The best lag must be more likely than a level that does not depend on position at
-    all. A shift must also be significant without any fifth of the flight, because one dip, jump of the position or
-    frozen track must not decide. A lag that repeated readings explain is not a shift.
+    all. A shift must also be significant if any fifth of the flight is left out, so that it does not depend on a single
+    dip, jump of the position or frozen track. A lag that is explained by repeated levels is not a shift.
     """
     alive = [channel for channel in channels if not channel.flat]  # a constant level contains no information about time
     named = [channel.along.predicted_db for channel in alive]
@@ -243,7 +244,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         )  # fmt: skip
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
-    # find likely lags with a guess of the correlation time, then fit the correlation time at these lags
+    # find likely lags with an assumed correlation time, then fit the correlation time at these lags
     first = np.sum([b.likelihood(lags, [_START]) for b in bins.values()], axis=0)
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # the likeliest lag of each model, and zero
     parts = {name: b.fitted(starts) for name, b in bins.items()}
@@ -253,12 +254,12 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
 
     tried, nats = _finer(lags, likelihood, window_s)
     estimate = _judged(tried, nats, list(bins), window_s)
-    # channels of one computer have one lag, so their log likelihoods add
+    # channels of one computer have the same lag, so their log likelihoods are added
     total = nats.sum(axis=0).max(axis=1)  # the most likely model at each lag
     n = sum(b.n for b in bins.values())
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
     explained = total.max() - sum(b.constant() for b in bins.values())
-    if explained < EVIDENCE_NAT + np.log(len(lags)):  # a gain of this size occurs by chance among this number of lags
+    if explained < EVIDENCE_NAT + np.log(len(lags)):  # a smaller gain occurs by chance among so many lags
         return replace(estimate, verdict=CANNOT_TELL, reason=_NO_DEPENDENCE)
     lag_s, held_s = estimate.radio_minus_telemetry_s, _held_s(alive)
     held = 0.0 < lag_s <= held_s
@@ -271,9 +272,9 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
 
 
 def _held_s(channels: Sequence[ClockChannel]) -> float:
-    """Return the age of repeated readings that one reading in ten exceeds [s].
+    """Return the 90th percentile of the age of repeated levels [s].
 
-    A repeated reading is late although the clock is right. Readings at a limit of the receiver are not counted.
+    A repeated level is late even if the clock is right. Levels at a limit of the receiver are not counted.
     """
     old_s = [np.zeros(1)]
     for channel in channels:
@@ -285,7 +286,7 @@ def _held_s(channels: Sequence[ClockChannel]) -> float:
 
 
 def _shown_without(bins: Mapping[str, _Bins], parts: Mapping[str, list[_Parts]], lag_s: float) -> bool:
-    """Check whether a lag is more likely than zero without any two neighbouring parts of the flight."""
+    """Check whether a lag remains more likely than zero if any two neighbouring parts of the flight are left out."""
     start, end = min(b.mean_s[0] for b in bins.values()), max(b.mean_s[-1] for b in bins.values())
     lags = np.array([lag_s, 0.0, *((-_SAME_S, _SAME_S) if abs(lag_s) > _AGREE_S else ())])
     for part in range(_LEFT_OUT - 1):
@@ -313,7 +314,7 @@ def _finer(
     nats, step = likelihood(lags), _STEP_S
     while step > _FINEST_S:
         total = nats.sum(axis=0).max(axis=0)
-        # 2 nat of margin, because a lag that is not excluded may lie between two excluded lags
+        # keep a margin of 2 nat, because a lag that is not excluded may lie between two excluded lags
         near = lags[total > total.max() - EVIDENCE_NAT - 2.0]
         if len(near) > _MOST_FINE:
             break
@@ -364,7 +365,7 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means (n,) of a channel's levels, times (s,) of the predictions, and the index of the first time of each mean.
+    """Means (n,) of a channel's levels, times (s,) of the predictions, and index of the first prediction of each mean.
 
     ``features`` of directions are averaged over the same duration about each time. ``levels`` (g, models) are the
     predictions.
@@ -384,7 +385,7 @@ class _Bins:
 
     @classmethod
     def of(cls, channel: ClockChannel, models: Sequence[str], features: FloatArray, window_s: float) -> _Bins | None:
-        """Return the bins of a channel that have a prediction at every lag of the window, or None if they are few."""
+        """Return the bins of a channel with a prediction at every lag of the window, or None if there are too few."""
         along = channel.along
         levels = np.column_stack([along.predicted_db[name] for name in models])
         t, y = np.asarray(channel.time_s), channel.measured_db
@@ -400,7 +401,8 @@ class _Bins:
         t, y = t[order], y[order]
         if not len(t):
             return None
-        # one second, or more on flights over a quarter of an hour, because the cost grows with the number of bins
+        # average over one second, or longer on flights of more than a quarter of an hour, because the cost grows with
+        # the number of bins
         width = max(1.0, (t[-1] - t[0]) / _BINS)
         _, first, count = np.unique(np.floor(t / width), return_index=True, return_counts=True)
         if len(first) < _FEWEST:
@@ -423,7 +425,7 @@ class _Bins:
         low = place.astype(np.int64)
         share = (place - low)[:, None]
         out = table.take(low, axis=0)
-        out *= 1.0 - share  # in place and with take, because indexing with brackets and new tables takes twice the time
+        out *= 1.0 - share  # in place and with take: new tables and brackets would take twice the time
         out += table.take(low + 1, axis=0) * share
         return out
 
@@ -436,12 +438,12 @@ class _Bins:
             level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
             residual = self.mean_db[:, None] - level
             out[:, row, :features] = self._between(self.mean_s - lag, self.features)
-            # the offset is fitted in any case, and sums of numbers near 0 lose less precision
+            # subtract the mean, which the fitted offset absorbs, because sums of numbers near 0 lose less precision
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 
     def likelihood(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
-        """Return the log likelihood (models, lags) of means ``kept`` with the best parts."""
+        """Return the log likelihood (models, lags) of the means ``kept`` with the best of ``parts``."""
         blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
         return np.asarray(np.concatenate([self._tried(block, parts, kept).max(axis=0) for block in blocks]).T)
 
@@ -463,7 +465,7 @@ class _Bins:
 
 
 def _calm(mean_db: FloatArray) -> FloatArray:
-    """Limit the difference of means (n,) from their neighbours, so that a single dip has little weight."""
+    """Limit how far means (n,) deviate from their neighbours, so that a single dip has little weight."""
     from scipy.ndimage import median_filter
 
     middle = median_filter(mean_db, _NEIGHBOURS, mode="nearest")
@@ -482,7 +484,7 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
 
     finite: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
     reach = int(width / 2 + 0.5)
-    # a centred window, because any other would add a lag
+    # use a centred window, because any other window would add a lag
     weights = np.clip(width / 2 + 0.5 - np.abs(np.arange(-reach, reach + 1)), 0.0, 1.0)
     share = correlate1d(finite.astype(np.float64), weights, mode="nearest")
     out = correlate1d(np.where(finite[:, None], table, 0.0), weights, axis=0, mode="nearest")
@@ -501,7 +503,7 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
     some = unit[:: max(1, len(unit) // 1500)]
     base = some[determining(some, covariance, _LEFT, _FEATURES)]
     out = np.full((len(direction), len(base)), np.nan)
-    # the added diagonal covers rounding errors; it changes little, because the points are almost independent
+    # add a small diagonal against rounding errors. It has little effect, because the points are almost independent.
     known = Factor.of(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out[finite] = known.whiten(covariance(unit, base).T).T
     return out
@@ -542,7 +544,7 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
     memories = list(dict.fromkeys((part.memory_s, part.white) for part in parts))
     white, log_det = _whitened(columns, time_s, memories)
     lags = range(columns.shape[1])
-    # the likelihood needs only these small matrices, so the gains are varied without the rows
+    # compute these small matrices once: with them, the likelihood for other gains does not need the rows
     gram = np.stack([[white[:, m, lag].T @ white[:, m, lag] for lag in lags] for m in range(len(memories))])
     n, p = len(columns), columns.shape[2] - residuals
     out = np.empty((len(parts), len(lags), residuals))
@@ -593,7 +595,7 @@ def clock_trap(
     radio_span, telemetry_span : (first, last)
         First and last time, as datetime64 (UTC) or epoch seconds.
     timezone : str, optional
-        IANA zone of the site. A shift equal to its offset from UTC on that day is explained by it.
+        IANA zone of the site. A shift that equals the zone's offset from UTC on that day is explained by the zone.
 
     Returns
     -------
@@ -613,11 +615,11 @@ def clock_trap(
         start = np.maximum(radio[0] + 3600.0 * hours, telemetry[0])
         return np.asarray(np.maximum(0.0, np.minimum(radio[1] + 3600.0 * hours, telemetry[1]) - start))
 
-    # UTC-12 to UTC+14, with half hours for India and Newfoundland
+    # shifts of up to 14 h, with half hours for India and Newfoundland
     shifts = np.asarray(np.arange(-28, 29) * 0.5, dtype=np.float64)
     shared = overlap(shifts)
     now = float(overlap(np.zeros(1))[0])
-    # full hours before half hours, small shifts before large ones
+    # prefer full hours to half hours, and small shifts to large shifts
     order = [(-round(float(shared[i])), shifts[i] % 1 != 0, abs(float(shifts[i])), i) for i in range(len(shifts))]
     best = min(order)[-1]
     shorter = min(radio[1] - radio[0], telemetry[1] - telemetry[0])
@@ -638,13 +640,13 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
         moment = datetime.fromtimestamp(instant, utc.utc).astimezone(ZoneInfo(timezone))
         offset = moment.utcoffset()
         east = offset.total_seconds() / 3600.0 if offset else 0.0
-        # local time is behind UTC in western zones, so hours are added to the radio clock
+        # west of Greenwich, local time is behind UTC, so hours are added to the radio times
         if east and hours == -east:
             return f"radio times are local time ({timezone}) stored as if they were UTC", False
         if east and hours == east:
             stored = "telemetry times are local time stored as if they were UTC"
             return f"radio times are UTC read as {timezone}, or {stored}", True
-        # a log is read too late by hours if its zone is that many hours east of the named zone
+        # the times of a log are too late by ``hours`` if its clock was in a zone that many hours east of the named zone
         fits = f"UTC{east - hours:+g} fits the radio times, UTC{east + hours:+g} the telemetry"
         wrong = f"the clocks differ by {hours:+g} h: {timezone} (UTC{east:+g}) is the wrong zone ({fits})"
         saving = ", or daylight saving was taken into account in one log only"
@@ -652,7 +654,7 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
     return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only", False
 
 
-# Largest median distance of two receivers on one aircraft [m].
+# Largest median distance between the positions of two receivers on one aircraft [m].
 _AGREE_M = 12.0
 # A log is not on the track if the median distance of a few of its points exceeds this at every shift [m].
 _NEAR_M = 4.0 * _AGREE_M
@@ -680,10 +682,11 @@ class Origin:
 def origin_of(log: Stream, track: Stream) -> Origin | None:
     """Return the zero of relative times that puts the positions of a log on a track.
 
-    Returns None if there is no such time, or more than one.
+    Return None if there is no such time, or more than one.
 
-    Both contain positions of the aircraft: the log at relative times t, the track at UTC. The search minimises the
-    median of ``|p_log(t) - p_track(t + s)|`` over shifts s, in steps of a second, then of 0.1 s near the best one.
+    The log contains positions of the aircraft at relative times t, and the track contains positions at UTC. The search
+    minimises the median of ``|p_log(t) - p_track(t + s)|`` over shifts s, in steps of a second, then of 0.1 s near the
+    best shift.
 
     Parameters
     ----------
@@ -699,7 +702,7 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     time_s = mine[0].astype(np.int64) / 1e9
     track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
     log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
-    # horizontally, because the two logs may have different zeros of height
+    # compare horizontal positions, because the two logs may have different zeros of height
     line = shapely.linestrings(track_m[:, :2])
     shapely.prepare(line)
     # at least a quarter of the positions must be this close to the track at any time
@@ -721,7 +724,7 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     finer = _median_distances(fine, time_s, log_m, track_s, track_m)
     distance = float(np.nanmin(finer))
     second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
-    # compare with the other seconds at full seconds, because an aircraft moves some metres between seconds
+    # compare with the other origins at full seconds, because an aircraft moves some metres within a second
     if distance > _AGREE_M or second < _UNIQUE * max(float(misses[best]), 1.0):
         return None
     origin_s = zero_s + float(fine[int(np.nanargmin(finer))])
@@ -736,10 +739,10 @@ def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray
     places = np.column_stack([frame[name].to_numpy(np.float64) for name in names])
     known = np.flatnonzero(np.isfinite(places[:, :2]).all(axis=1))
     time, first = np.unique(frame["time"].to_numpy("datetime64[ns]")[known], return_index=True)
-    # fewer positions may be on a track by chance
+    # a log with fewer positions may match a track by chance
     if len(time) < 20:
         return None
-    # evenly over the flight, because all flights have a similar take-off
+    # take positions from the complete flight, because take-offs are similar on all flights
     at = slice(None) if most is None or len(time) <= most else np.linspace(0, len(time) - 1, most).astype(int)
     return time[at], places[known[first]][at]
 

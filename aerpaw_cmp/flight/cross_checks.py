@@ -1,4 +1,4 @@
-"""Questions about logs: contradictions with file names, clocks or ground heights, and assumptions.
+"""Questions about logs: contradictions with file names, clocks or ground heights, and unclear assumptions.
 
 The module also assigns the logs of several flights to their flights, by time and position.
 """
@@ -26,7 +26,7 @@ from .track import Track
 
 # Largest pause between logs of one flight. Radios are started before take-off.
 SLACK = np.timedelta64(5, "m")
-# Two tracks at the same time belong to two aircraft if they are farther apart than this [deg] (about 5 km).
+# Two tracks at the same time belong to two flights if they are farther apart than this [deg] (about 5 km).
 APART_DEG = 0.05
 
 Span = tuple[np.datetime64, np.datetime64]
@@ -49,7 +49,7 @@ class Flight:
 
     @property
     def measured(self) -> list[Stream]:
-        """The streams that can be compared."""
+        """The streams that can be compared: levels and ranks."""
         return [stream for file in self.files for stream in file.result.streams if stream.kind in ("rss", "rank")]
 
     @property
@@ -64,9 +64,9 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     """Return the flights of a set of logs in order of time.
 
     Each telemetry log begins a flight. A radio log belongs to the flight with which it shares most time. A log with
-    relative times belongs to the flight whose track contains its positions, or else to the flight in its folder.
-    Otherwise it belongs to the only flight, or it is a separate flight. If several logs have both levels and positions
-    and there is no absolute time, each is a flight.
+    relative times belongs to the flight whose track contains its positions, or else to the flight in its folder. If
+    there is only one flight, it belongs to that flight, otherwise it is a separate flight. If several logs have both
+    levels and positions but no absolute time, each of them is a flight.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
         flight.files.append(file)
         if _tracks(file) or not any(_tracks(member) for member in flight.files):
             assert flight.span is not None
-            # a radio that was left on does not extend a flight that has a track
+            # a radio may have been left on after the flight, so only a track determines the span
             flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
             flight.place = flight.place or place
     for file in files:
@@ -111,7 +111,7 @@ def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
     if first and second and not first & second:
         (shown, other) = (" ".join(min(found)) for found in (first, second))
         return f"its name has {shown}, the name of the track has {other}: which flight?"
-    # absolute times count more than a name, because an evening flight has the date of the next day in UTC
+    # trust absolute times more than a name, because an evening flight has the date of the next day in UTC
     if _span_of(file) is not None:
         return ""
     dates = [{"-".join(parts) for parts in _DATE.findall(name)} for name in names]
@@ -159,7 +159,7 @@ def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool
         return False
     if place is None or flight.place is None:
         return True
-    # the margin applies to radios only: two tracks must share time
+    # the margin is for radios, which start before take-off; two tracks must overlap without it
     return meet(flight.span, span) and max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
 
 
@@ -170,7 +170,7 @@ def _shared(first: Span | None, second: Span) -> np.timedelta64:
 
 
 def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
-    """Return the zero of relative times that puts the positions of a log on the track of a flight, or None."""
+    """Return the origin of relative times that puts the positions of a log on the track of a flight, or None."""
     track = next((track for member in flight.files for track in _tracks(member)), None)
     # use the longest stream, because a log of a hundred cells has the positions of one receiver a hundred times
     placed = [stream for stream in file.result.streams if "latitude_deg" in stream.frame]
@@ -190,7 +190,7 @@ def _called(flight: Flight) -> str:
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
     """Return the flight of a file without absolute times, and add it to ``groups`` if it is new."""
-    # a log with levels and positions is complete, and its relative times have no relation to those of other logs
+    # a log with levels and positions is complete, and its relative times are not related to those of other logs
     alone = Flight([file]).complete
     known = [flight for flight in groups if flight.span is not None] if alone else groups
     by_track = [
@@ -219,13 +219,14 @@ _IN_NAME = re.compile(
     r"(?<!\d)(20\d\d)[-_]?([01]\d)[-_]?([0-3]\d)(?:[T_ -]([0-2]\d)[-_:]?([0-5]\d)(?:[-_:]?([0-5]\d))?)?(?!\d)"
 )
 
-# A date in a name may be local or UTC, and that of the start or of the end.
+# Largest difference of a log from a date in its name. The date may be local or UTC, and that of the start or of the
+# end.
 _OF_THE_DAY = timedelta(hours=36)
 
-# A time in a name may be earlier than the log, because a program starts before its radio.
+# Largest difference of a log from a time in its name. The program that names the log starts before its radio.
 _OF_THE_MINUTE = timedelta(minutes=15)
 
-# A track does not begin at take-off if its lowest height differs from 0 by more than this [m].
+# A track probably does not begin at take-off if its lowest height differs from 0 by more than this [m].
 _GROUND_M = 5.0
 
 
@@ -261,7 +262,8 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     return list(dict.fromkeys(texts))
 
 
-# If the lowest height of a track is above this [m], its heights have another datum: no flight is that high throughout.
+# If the lowest height of a track is above this [m], its heights must have another datum, because no flight is that high
+# all the time.
 _TOO_HIGH_M = 150.0
 
 # A log whose start differs from that of the telemetry by full hours, within this time [s], has a wrong time zone.
@@ -289,8 +291,8 @@ def doubts(
     undated : sequence of str
         Logs with positions and relative times that the flight file dates, although the telemetry has absolute times.
     takeoff_ground_m : float
-        Height of the take-off point above the ground at the site's origin. If the heights of the log are above
-        sea level, it is minus the height of that ground above sea level.
+        Height of the take-off point above the ground at the site's origin. For a log with heights above sea level, it
+        is minus the height of the ground at the origin above sea level.
 
     Returns
     -------
@@ -331,7 +333,7 @@ _REST_S, _REST_M, _CLIMB_M = 5.0, 0.5, 5.0
 
 
 def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
-    """Check that the heights of a flight count from take-off, and not from the sea.
+    """Check that the heights of a flight are above take-off, and not above sea level.
 
     Parameters
     ----------
@@ -343,13 +345,14 @@ def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        A clause for the summary of a report if the lowest height is close to the ground of the site above the sea.
+        A clause for the summary of a report if the lowest height is close to the height of the site's ground above sea
+        level.
 
     Raises
     ------
     InputError
-        If no sample is below :data:`_FLOWN_M`, or if the UAV rests and takes off at about the height of the ground of
-        the site above the sea.
+        If no sample is below :data:`_FLOWN_M`, or if the UAV rests and takes off at about the height of the site's
+        ground above sea level.
     """
     low_m, sea_m = _lowest_m(telemetry), site.ground_above_sea_m
     if low_m is None or "takeoff_from" in telemetry.attributes:
@@ -408,7 +411,7 @@ def _start(streams: Sequence[Stream]) -> datetime | None:
 
 
 def _name_starts(path: str) -> list[tuple[datetime, str, timedelta]]:
-    """Return the dates in the name of a file, with the form of each and the largest usual difference from the log."""
+    """Return the dates in the name of a file, each with its format and the largest usual difference from the log."""
     starts = []
     for match in _IN_NAME.finditer(Path(path).name):
         parts = [int(part) for part in match.groups() if part is not None]
@@ -424,7 +427,7 @@ def _name_starts(path: str) -> list[tuple[datetime, str, timedelta]]:
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
     """Return the smallest difference of a time, read as UTC or local time (in any zone if unknown), from the start."""
     if not exact:
-        # a date without a time means its noon
+        # for a date without a time, compare with noon
         return abs(start - time - timedelta(hours=12))
     if zone is not None:
         # use the offset of that day, because a zone has two offsets per year
@@ -446,6 +449,6 @@ def _lowest_m(stream: Stream) -> float | None:
         return None
     # use a percentile, because a row of a receiver without a fix may be far too low
     low = float(np.percentile(height, 1.0))
-    # also use the first height, because a log may end in the air; but not if it jumps, as without a fix
+    # also use the first height, because a log may end in the air; but not if the heights jump, as they do without a fix
     begins = np.abs(np.diff(height[: len(height) // 100 + 2], prepend=0.0)).max() <= _GROUND_M
     return min(low, float(height[0])) if begins else low

@@ -39,12 +39,13 @@ from .rows import FLAG, frozen, lock_of, scored_rows, unscored, without_values
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, RankSettings, SiteChoice
 from .track import Track, TrackPoses, at_height, good_positions, lacks_height, raised
 
-# A log with relative times starts at its origin. If it starts later than this, its times are absolute.
+# A log with relative times starts at its origin. If a log starts later than this after the origin, its times are
+# absolute.
 _NEAR_ORIGIN = pd.Timedelta(days=2)
 
 
 def idle_log_keys(log: LogSettings, file: IngestedFile) -> list[str]:
-    """Return warnings about keys of a line of ``logs:`` that have no effect, one per reason."""
+    """Return warnings about keys without effect in an entry of ``logs:``, one warning per reason."""
     streams = file.result.streams
     kinds = {stream.kind for stream in streams}
     keys: dict[str, list[str]] = {}
@@ -65,7 +66,7 @@ def idle_log_keys(log: LogSettings, file: IngestedFile) -> list[str]:
 
 
 def _starts_near(origin: str, file: IngestedFile) -> bool:
-    # an origin that cannot be read becomes NaT, which is not near any time
+    # an unreadable origin becomes NaT, which is not near any time
     zero = pd.to_datetime(origin, errors="coerce", utc=True).tz_localize(None)
     times = [s.frame["time"].min() for s in file.result.streams if len(s.frame) and "time" in s.frame]
     return not times or bool(np.min([abs(time - zero) for time in times]) < _NEAR_ORIGIN)
@@ -118,17 +119,17 @@ class RssSeries:
     settings_key : str
         A key that is equal for series with equal link settings. Such series share a replay.
     log : (n,) int
-        Number of the log (n,) under ``logs:`` that contains each sample.
+        Number of the log under ``logs:`` that contains each sample.
     line : (n,) int
-        Line (n,) of each sample in that log.
+        Line of each sample in that log.
     noise_dbm : float, optional
         Noise of the receiver for a signal-to-noise ratio, if its bandwidth or floor is known [dBm]. None for levels.
     flagged : mapping of str to int
         Numbers of rows of the log that are excluded because of a flag, by flag.
     serving : (n,), optional
-        Serving state of a cell: 1 if it served the phone, 0 if another did, NaN unknown (n,). None for other levels.
+        Serving state of a cell: 1 if it served the phone, 0 if another cell did, NaN unknown. None for other levels.
     locked : (n,), optional
-        Receiver lock of a sounder: 1 in lock, 0 without lock, NaN unknown (n,). None for other levels.
+        Receiver lock of a sounder: 1 in lock, 0 without lock, NaN unknown. None for other levels.
     """
 
     tower: str
@@ -166,7 +167,7 @@ class RankSeries:
 
     @property
     def channel(self) -> str:
-        """The kind of the series, used as the name of its channel."""
+        """The kind of the series, which is used as the name of its channel."""
         return "rank"
 
 
@@ -181,7 +182,7 @@ class FlightData:
     site_place : str or Path
         Site file in the folder of the flight file, or the name of a packaged site.
     nodes : mapping of str to Track
-        Tracks of the towers that move. ``site`` has them at the middle of their positions.
+        Tracks of the towers that move. ``site`` contains each of them at the median of its positions.
     doubts : tuple of str
         Clauses about clocks and heights that the summary of a report repeats.
     cautions : tuple of str
@@ -226,7 +227,7 @@ class FlightData:
     def tower_at(self, tower: str, time: Times) -> tuple[FloatArray, BoolArray]:
         """Return the array centre of a tower at times (n,), NaN if unknown, and a mask (n,) of the known positions.
 
-        The shape is (1, 3) for a fixed tower, and (n, 3) for one that moves.
+        The shape is (1, 3) for a fixed tower, and (n, 3) for a tower that moves.
         """
         if tower not in self.nodes:
             return self.site.towers[tower].position_m[None, :], np.ones(len(time), dtype=np.bool_)
@@ -280,14 +281,14 @@ def ground_nodes(
     Returns
     -------
     Site
-        Site in which a node that moves is at the middle of its positions.
+        Site that contains a moving node at the median of its positions.
     dict of str to Track
         Tracks of the nodes that move, by name.
 
     Raises
     ------
     UsageError
-        If the site already has the name.
+        If the site already has a tower with this name.
     InputError
         If a track has no positions, or its times are unknown.
     """
@@ -343,7 +344,7 @@ def _tracked_node(
     # the height of a node on the ground does not change
     if max(reach_m, float(np.nanmax(np.abs(up - height_m))) if logged else 0.0) <= STANDS_STILL_M:
         return at, None, ()
-    # the heights of a node on the ground are not used and may be missing
+    # the logged heights of a node with ``height: ground`` are not used and may be missing
     track = _track_of(site, frame if logged else frame.assign(altitude_m=0.0), settings)
     if not len(track):
         raise InputError(
@@ -381,12 +382,12 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
     raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
 
 
-# All columns of telemetry except fix and satellites, which are not part of a pose.
+# All columns of telemetry except fix and number of satellites, which are not part of a pose.
 _TELEMETRY = COLUMNS["telemetry"][:-2]
 
 
 def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> tuple[IngestedFile, ...]:
-    """Read every log of the flight file, in its order.
+    """Read every log of the flight file, in the order of the file.
 
     Raises
     ------
@@ -398,7 +399,7 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     # an archive or file that contains several logs is read once
     root, cache = logs_root or folder, Held()
     for log in settings.logs:
-        # report a missing log before the logs above it are read for minutes
+        # report a missing log now, because reading the logs before it may take minutes
         named_log(root, log.path)
     # a table may have several lines, each of which reads some of its columns
     columns = {(log.path, name) for log in settings.logs for name in log.columns.values()}
@@ -437,7 +438,7 @@ def quantity_of(data: FlightData, series: RankSeries) -> str:
 def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettings]:
     """Return the noise power of an SNR [dBm] (None if the flight file does not specify it), and the link to use.
 
-    An SNR estimator knows the signal and also reports ratios below 0 dB, so the link has no noise floor.
+    An SNR estimator correlates with a known signal and also reports ratios below 0 dB, so the link has no noise floor.
     """
     if not is_ratio(stream, (SNR,)) or link.bandwidth_hz is None:
         return None, link
@@ -515,7 +516,7 @@ def gather(
         track = _flown_track(site, path, telemetry, settings)
         warnings += [f"{path}: {text}" for text in track.account.warnings]
         rss = [(place, _moving(place, series, track, warnings)) for place, series in rss]
-    # without any positions, the check of the overlap reports the error with a better message
+    # if nothing has positions, keep the levels: the check of the overlap then reports the error with a better message
     elif rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are ignored")
@@ -534,14 +535,14 @@ def gather(
     if track is not None:
         asked += doubts(track, telemetry, _times_on_track(data), _undated(data, path), site.takeoff_ground_m)
         asked += check_heights(site, path, telemetry)
-    # after the check of the overlap, so that a flight without common times has its own message
+    # add the warnings after the check of the overlap, because a flight without common times has a separate message
     every = (*cautions, *_idle_attitude(data), *warnings, *(f"{text}." for text in asked))
     return dataclasses.replace(data, doubts=asked, warnings=every, cautions=cautions)
 
 
 @dataclass(slots=True, kw_only=True)
 class _Found:
-    """Streams of the logs with their paths, sorted by use, and warnings.
+    """Streams of the logs with their paths, grouped by use, and warnings.
 
     ``placed`` contains the ranks with their own positions, ``void`` the errors of series without any value.
     """
@@ -633,10 +634,10 @@ def _unknown(key: str, kind: str, name: str, valid: Sequence[str]) -> NoReturn:
 
 
 def _learned_cautions(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:
-    """Return one sentence per caution about learned antennas. It names the channels if only some are affected."""
+    """Return one sentence per caution about learned antennas, with the channels if only some are affected."""
     touched: dict[tuple[str, str], list[str]] = {}
     for caution in settings.cautions:
-        # None is the link of all channels without an entry
+        # the channel None means all channels without a link of their own
         links = settings.link.channels if caution.channel is None else {*channels} - {caution.channel}
         concerned = [channel for channel in channels if channel not in links]
         if concerned or caution.key == "rank.receiver":
@@ -658,7 +659,7 @@ def _idle_channels(settings: FlightFile, channels: Sequence[str]) -> tuple[str, 
 
 
 def _unknown_receivers(settings: FlightFile, site: str | Path) -> tuple[str, ...]:
-    """Return a sentence about receivers of the flight file that the site has not learned. Empty if there are none."""
+    """Return a sentence about receivers without a learned model that the flight file names. Empty if there are none."""
     named = {log.receiver for log in settings.logs if log.receiver}
     known: set[str] = set()
     with suppress(InputError, UsageError):
@@ -670,7 +671,7 @@ def _unknown_receivers(settings: FlightFile, site: str | Path) -> tuple[str, ...
 
 
 def _undated(data: FlightData, track: str) -> list[str]:
-    """Return the logs with positions whose times depend on 'time_origin' although the track has a clock."""
+    """Return the logs with positions whose times depend on 'time_origin' although the track has absolute times."""
     dated = {log.path for log in data.settings.logs if log.time_origin is not None}
     return [
         log.path
@@ -702,7 +703,7 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
-    """Return remarks about ratios that are compared as levels, because their noise is unknown."""
+    """Return remarks about ratios that are compared as levels, because the noise power is unknown."""
     ratios = [s for s in streams if is_ratio(s) and s.name not in log.skip]
     blind = [s.name for s in ratios if _noise(s, links.of(_channel_of(log, s)))[0] is None]
     if not blind:
@@ -788,13 +789,13 @@ def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -
     if not can.any():
         return float("nan")
     east, north = site.frame.to_local(latitude_deg[can], longitude_deg[can])
-    # one tower at a time, which limits the memory for long flights
+    # compute one tower at a time to limit the memory for long flights
     gaps = [np.hypot(east - t.position_m[0], north - t.position_m[1]).min() for t in site.towers.values()]
     return float(np.min(gaps, initial=np.inf))
 
 
 def _idle_attitude(data: FlightData) -> tuple[str, ...]:
-    """Return warnings if ``rt.attitude`` has no effect or only a partial one."""
+    """Return warnings if ``rt.attitude`` has no effect, or an effect on only a part of the flight."""
     messages = []
     for kind, series in data.series:
         mode = data.settings.rank_rt.attitude if kind == "rank" else data.settings.rss_attitude
@@ -916,7 +917,7 @@ def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str])
     Raises
     ------
     UsageError
-        If two logs contain the same series at the same time, because only one could be compared.
+        If two logs contain the same series at the same time, because only one of them could be compared.
     """
     groups = lists_by_key((name(series), (path, series)) for path, series in parts)
     return tuple(_record(what, group) for what, group in groups.items())
@@ -962,7 +963,7 @@ def _joined(parts: Sequence[RssSeries | RankSeries], name: str) -> AnyArray:
 
 
 def _form(series: RssSeries | RankSeries) -> object:
-    """Return the properties that must be equal in all parts of one record."""
+    """Return the properties that must be equal in all parts of a series."""
     return series.unit if isinstance(series, RssSeries) else series.position_m is None
 
 
@@ -972,7 +973,7 @@ def _text(stream: Stream, key: str) -> str | None:
 
 
 def _check_overlap(data: FlightData) -> None:
-    """Check that every series overlaps in time with the track of the UAV, and with that of a tower that moves."""
+    """Check that every series overlaps in time with the track of the UAV, and with the track of a moving tower."""
     if not data.rss and not data.rank:
         raise UsageError(
             "none of the logs contains RSS or rank",

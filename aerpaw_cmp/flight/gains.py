@@ -52,7 +52,8 @@ class LearnedGain:
     sd_db : (poses,)
         Standard deviation of the sum of learned gains [dB].
     spread : Spread
-        Error model of the level, excluding ``sd_db``. It comes from the tower's antenna, or else from the UAV's.
+        Error model of the level, excluding ``sd_db``. It is that of the tower's antenna, or else that of the UAV's
+        antenna.
     """
 
     pair_db: FloatArray
@@ -90,7 +91,7 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
 
 
 def spread_of(stated: LearnedSpread | None) -> Spread:
-    """Return the error model of a learned antenna, or an empty one (only the gain has an error) if it has none."""
+    """Return the error model of a learned antenna. If it has none, only the gain has an error."""
     return NO_SPREAD if stated is None else Spread(**stated.model_dump())
 
 
@@ -103,7 +104,7 @@ def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tupl
     sd_db = np.sqrt(square)
     if len(ends) == 2:
         (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
-        # the gain of a pair is valid only for the two patterns with which it was learned
+        # the gain of a pair applies only to the two patterns with which it was learned
         if tower.pair is not None and uav.trained_on == tower.trained_on:  # from one calibration
             return tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
     return np.zeros(len(sd_db)), sd_db
@@ -118,7 +119,7 @@ def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: Fl
     """Return the mean gain (n,) of the elements of an array in directions of its frame, limited to at least -60 dBi."""
     fields = [pattern.field(theta_rad, phi_rad) for pattern in patterns]
     power = sum(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2 for e_theta, e_phi in fields)
-    # nulls are limited to -60 dB, because no model of a pattern is that accurate
+    # limit nulls to -60 dB, because no pattern is accurate below that
     return np.asarray(10.0 * np.log10(np.maximum(power / len(patterns), 1e-6)))
 
 
@@ -166,12 +167,12 @@ def _reflection_loss(_site: Site, rt: RtSettings, _carrier_hz: float) -> Loss | 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathLoss:
-    """A loss of a path in addition to its field. Replay, explain, model comparison and audit use it.
+    """A loss of a path in addition to its field. Replay, ``explain``, model comparison and audit apply it.
 
     Parameters
     ----------
     name : str
-        Name of its term in ``explain``.
+        Name of the loss in ``explain``.
     off : mapping
         Keys and values of ``rt`` that switch the loss off. A model of the comparison includes a loss only if it sets
         these keys.
@@ -215,7 +216,7 @@ def without_losses() -> dict[str, Any]:
 
 
 def path_losses(site: Site, rt: RtSettings, carrier_hz: float) -> dict[str, Loss]:
-    """Return the losses of the paths of a flight by name. Each is a function like the result of :func:`path_loss`."""
+    """Return the losses of paths by name. Each loss is a function like the result of :func:`path_loss`."""
     every = ((declared.name, declared.of(site, rt, carrier_hz)) for declared in LOSSES)
     return {name: loss for name, loss in every if loss is not None}
 
@@ -246,7 +247,7 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     return loss
 
 
-# Any carrier, because sight lines do not depend on it.
+# An arbitrary carrier, because sight lines do not depend on the frequency.
 _ANY_HZ = 3.4e9
 
 
@@ -276,7 +277,8 @@ def load_with_learned(path: str | Path, learned: Path | None = None, overrides: 
     learned : Path, optional
         calibrated.yaml whose settings replace those of the flight file, including its named antennas.
     overrides : mapping, optional
-        Values of dotted keys. They are applied before the antennas are chosen, because an antenna must fit the carrier.
+        Values of dotted keys. They are applied before antenna names are replaced, because an antenna must fit the
+        carrier.
     """
     settings = with_learned(overridden(load_flight(path), overrides or {}), Path(path).parent)
     return settings if learned is None else joined(settings, learned)
@@ -346,7 +348,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
         If a key of ``antennas`` is neither ``uav`` nor ``TOWER.CHANNEL``.
     """
     ends = _Ends(settings.link.rss, dict(settings.link.channels))
-    # the airframe last, because it applies to every channel, and an antenna of a tower can add a channel
+    # use the airframe last, because it applies to every channel, and an antenna of a tower can add a channel
     for key, name in sorted(settings.antennas.items(), key=lambda item: item[0] == "uav"):
         tower, _, channel = key.partition(".")
         if key != "uav" and not (tower and channel):

@@ -1,4 +1,4 @@
-"""Replay of the series of a flight: poses from the track, and one replay per tower and link, with foliage.
+"""Replay of the series of a flight: poses from the track, foliage, and one replay per tower and link.
 
 The module also computes the levels of a flight relative to a model without antennas, with the directions at both ends.
 """
@@ -41,7 +41,7 @@ from .training import learned_here
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """The radio clock of one series: the estimate, and ``applied_s``, which is subtracted from radio times [s]."""
+    """The radio clock of one series: the estimate, and the lag ``applied_s`` to subtract from radio times [s]."""
 
     result: ClockResult
     applied_s: float
@@ -49,7 +49,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """A replayed series. ``valid`` (n,) marks samples with a known pose; all other arrays contain only these.
+    """A replayed series. ``valid`` (n,) marks samples with a known pose. All other arrays contain only these samples.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def replay_rss(
     data: FlightData, progress: Progress = logged, clocks: Sequence[Clock | None] | None = None
 ) -> list[Replayed]:
     """Replay every RSS series. Series of one tower with equal links share a replay."""
-    # one search of paths for all channels that share a link
+    # paths are searched once for all channels that share a link
     groups = lists_by_key(((series.tower, series.settings_key), index) for index, series in enumerate(data.rss))
     shifts = clocks or [None] * len(data.rss)
     rt, out = data.settings.rt, dict[int, Replayed]()
@@ -187,7 +187,7 @@ def replay_rss(
 def _towers_and_poses(
     data: FlightData, tower: str, times: Sequence[Times]
 ) -> tuple[list[BoolArray], list[FloatArray], list[TrackPoses]]:
-    """Return masks of times with known tower and UAV, and positions and poses at these times, per series."""
+    """Return, per series, a mask of times with known tower and UAV, and the positions and poses at these times."""
     valid, places, tracks = [], [], []
     for time in times:
         place, known = data.tower_at(tower, time)
@@ -208,8 +208,8 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
 def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock | None]:
     """Return the clock of each RSS series relative to the telemetry, as ``rss.lag`` specifies.
 
-    Series that one computer logged share a clock. The predictions are RSS of the image engine along the track, with at
-    most one reflection.
+    Series that were logged by one computer share a clock. The predictions are levels of the image engine along the
+    track, with at most one reflection.
     """
     lag = data.settings.rss.lag
     if lag == "off" or data.track is None:
@@ -232,7 +232,7 @@ def same_computer(data: FlightData) -> list[list[int]]:
         keys.add(("tower", series.tower))
         shared = [group for group in groups if group[0] & keys]
         groups = [group for group in groups if not group[0] & keys]
-        # this series merges all groups with which it shares a tower or a file
+        # merge all groups with which this series shares a tower or a file
         groups.append((keys.union(*(k for k, _ in shared)), [*(i for _, many in shared for i in many), index]))
     return [members for _, members in groups]
 
@@ -246,7 +246,7 @@ def _given_clock(receiver: str, lag_s: float) -> Clock:
     return Clock(result=result, applied_s=lag_s)
 
 
-# Number of times that are replayed together, which limits the memory on flights over half an hour.
+# Number of times that are replayed together. It limits the memory on flights of more than half an hour.
 BLOCK = 100_000
 
 # Spacing [s] and largest number of the predictions for the clock. Long flights have a larger spacing.
@@ -259,8 +259,8 @@ _MOVING_CLOCK_STEP_S = 0.25
 def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[ClockChannel]:
     """Return the levels that one computer logged, and their predictors along the telemetry, to estimate its clock.
 
-    Ratios (the ``quality`` of the sounder, an SNR) saturate and lose lock where levels do not. Therefore they are used
-    only if there are no levels.
+    Ratios (the ``quality`` of the sounder, an SNR) saturate or are lost at places where levels are not. Therefore they
+    are used only if there are no levels.
     """
     assert data.track is not None
     channels = [series for series in channels if series.unit != "dB"] or channels
@@ -342,7 +342,7 @@ def _levels_along(
 def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:
     """Return the levels (n,) for the clock, NaN below ``rss.minimum_height_m``.
 
-    Levels of a sounder are limited from below to its lock limit.
+    Levels of a sounder are raised to at least the level at which it loses lock.
     """
     levels, least = series.measured_db, data.settings.rss.minimum_height_m
     if least is not None:
@@ -367,9 +367,9 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
         rows = (paths.pose >= start) & (paths.pose < stop)
         return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)  # type: ignore[type-var]
 
-    # the part gets its share of the computing time
+    # attribute a proportional share of the computing time to the part
     share = (stop - start) / max(len(replayed.rss_dbm), 1)
-    # views, not copies, because the paths of a long flight are large
+    # use views instead of copies, because the paths of a long flight are large
     columns: dict[str, Any] = {name: getattr(replayed, name)[start:stop] for name in PER_LINK}
     return dataclasses.replace(
         replayed,
@@ -407,7 +407,7 @@ def rank_poses(data: FlightData, series: RankSeries) -> tuple[Poses, BoolArray, 
     position, valid = rank_positions(series, data.track)
     valid = valid & data.tower_at(series.tower, series.time)[1]
     track = None if data.track is None else data.poses_at(series.time).pick(valid)
-    # without an attitude the array keeps its orientation in the site
+    # if the track has no attitude, the array keeps its orientation in the site
     rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
     if track is not None:
         rotation[track.valid] = attitude_rotation(track, data.settings.rank_rt.attitude)[track.valid]
@@ -447,9 +447,9 @@ def replay_poses(
     ----------
     site : Site
     rt : RtSettings
-        Settings of the replay: depth, samples, foliage and others.
+        Settings of the replay, such as depth, samples and foliage.
     link : Link
-        Carrier, power and arrays. Its towers are those of ``site`` by name.
+        Carrier, power and arrays. The link names towers of ``site``.
     poses : Poses
     towers_m : (poses, 3), optional
         Positions of the tower of the link if it moves [m]. The link then has only this tower.
@@ -473,7 +473,8 @@ def replay_poses(
     towers = "+".join(link.tower_arrays)
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
     search = Search(engine, max_depth=rt.max_depth, samples=rt.advanced.samples, further=diffracted(rt.diffraction))
-    # the image engine finds the paths of each pose independently, but it numbers planes of terrain in order of use
+    # the image engine finds the paths of each pose independently, except that it numbers planes of terrain in order of
+    # use
     alone = engine == "image" and site.dem is None
     long = alone and len(poses) > BLOCK
     run = Run(

@@ -1,4 +1,4 @@
-"""Routes of an aircraft, from a plan, a map, a table of waypoints, or the log of an earlier flight.
+"""Routes of an aircraft, read from a plan, a map, a table of waypoints, or the log of an earlier flight.
 
 =====================  ============================================================================================
 file                   source of heights above take-off
@@ -39,7 +39,7 @@ from ..site.mapfiles import main_kml
 if TYPE_CHECKING:
     import pandas as pd
 
-# Columns of a route: height above take-off, yaw clockwise from north, seconds since its first point (NaN: a plan).
+# Columns of a route: altitude above take-off, yaw clockwise from north, time since the first point (NaN for a plan).
 COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "yaw_deg", "time_s")
 
 _SEA_LEVEL_FRAMES, _RELATIVE_FRAMES, _TERRAIN_FRAMES = (0, 5), (3, 6), (10, 11)
@@ -118,7 +118,7 @@ class _Route:
 
 def _route(data: bytes, path: str | Path) -> _Route:
     head = data[:HEAD_BYTES]
-    # try this before the log readers, because one of them might accept the JSON of a plan
+    # try a plan before the log readers, because a log reader might accept its JSON
     if re.match(rb"\s*\{", head) and b'"fileType"' in data[: 1 << 20]:
         return _plan(data, path)
     if re.match(rb"\s*QGC WPL \d+", head):
@@ -155,7 +155,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
             raise InputError(place, expected="heights above take-off in the file, or one height for all points")
         table["altitude_m"] = table["altitude_m"].fillna(height_m)
         route.remark(f"{int(silent.sum())} of {counted(len(table), 'point')} without a height: {height_m:g} m is used.")
-    # some programs count headings from -180, others from 0
+    # some programs write headings from -180 to 180, others from 0 to 360
     table["yaw_deg"] = table["yaw_deg"] % 360.0
     table.attrs["remarks"] = list(route.remarks)
     return table
@@ -163,7 +163,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
 
 def _log(path: str | Path) -> _Route:
     """Return the track of a log."""
-    # use any zone and origin, because a route has no date
+    # pass an arbitrary zone and origin, because a route has no date
     file = read_file(path, options=ReadOptions(timezone="UTC", time_origin="2000-01-01T00:00:00"))
     tracks = [stream for stream in file.result.streams if "latitude_deg" in stream.frame.columns]
     if not tracks:
@@ -248,7 +248,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
     route : _Route
     items : sequence of _Item
     home : tuple of float
-        Latitude, longitude and altitude above sea level of the planned take-off; may be empty.
+        Latitude, longitude and altitude above sea level of the planned take-off. It may be empty.
     named_yaw : bool
         True if the fourth parameter of a waypoint is its yaw; ArduPilot ignores it.
     """
@@ -260,7 +260,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
             _turn(route, item)
         if item.command == _RETURN:
             route.remark("The return to the take-off at the end is ignored.")
-        if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 and null mean the current position
+        if not (latitude or longitude) or math.isnan(latitude):  # 0, 0 or null: the current position
             latitude, longitude = place
         if item.command not in (*_WAYPOINTS, *_TAKEOFFS, *_LANDINGS) or math.isnan(latitude):
             continue
@@ -274,7 +274,7 @@ def _turn(route: _Route, item: _Item) -> None:
     degrees, direction, relative = item.numbers[0], item.numbers[2], item.numbers[3]
     if relative == 1:
         route.remark("Turns relative to the course are ignored.")
-    # -1, 0 or 1; anything else is another program's parameter
+    # valid directions are -1, 0 and 1; other values are a parameter of another program
     elif math.isfinite(degrees) and abs(direction) <= 1:
         route.points[-1] = (*route.points[-1][:3], degrees, math.nan)
 
@@ -300,7 +300,7 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
 
 # --- KML ---------------------------------------------------------------------------------------------
 
-# A line begins on the ground if its first point is at least this far below the highest one [m].
+# A line begins on the ground if its first point is at least this far below its highest point [m].
 _CLIMB_M = 5.0
 
 _HEADING = re.compile(r"\s*(-?\d+(?:\.\d*)?)")
@@ -325,7 +325,7 @@ def _kml(data: bytes) -> _Route:
     for shape in lines or shapes:
         modes = kml.modes_of(shape)
         sea_level |= "absolute" in modes
-        # clamping to the ground is the default of KML: a 0 in drawn lines is then not a height
+        # KML clamps to the ground by default: a 0 in drawn lines is then not a height
         clamped = not modes or any(mode.startswith("clamp") for mode in modes)
         headings = [float(m[1]) for angles in named(shape, "angles") if (m := _HEADING.match(str(angles.text or "")))]
         for index, place in enumerate(kml.places_of(shape)):
@@ -375,13 +375,13 @@ _NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|\.\d+)([eE][-+]?\d+)?\s*")
 
 def _sheet(data: bytes) -> _Route:
     """Return the waypoints of a table, which without a header are latitude, longitude, height and yaw."""
-    # read one line at a time, so that a table beyond the limit is refused before all of it is in memory
+    # read line by line, so that a table beyond the limit is refused before all of it is in memory
     text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace")
     lines = (line for line in text if line.strip() and not line.lower().lstrip().startswith(("#", "sep=")))
     head = next(lines, None)
     if head is None:
         raise InputError("the file is empty", expected=_EXPECTED)
-    # any semicolon or tab separates cells: commas may then be decimal commas
+    # if there is a semicolon or tab, it separates cells, because commas may then be decimal signs
     sign = next((sign for sign in "\t;" if sign in head), ",")
     # quoted names may contain the separator
     rows: Iterator[list[str]] = csv.reader(chain([head], lines), delimiter=sign, skipinitialspace=True)
@@ -423,7 +423,7 @@ def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], unit
     """
     try:
         cells = [row[index].strip() if 0 <= index < len(row) else "" for index in columns.values()]
-        if not any("." in cell for cell in cells):  # next to a decimal point, a comma may separate thousands
+        if not any("." in cell for cell in cells):  # if there is a point, a comma may separate thousands
             cells = [cell.replace(",", ".") for cell in cells]
         values = [
             float(dictionary.converted(np.array(float(cell)), units[index])) if cell else math.nan

@@ -27,17 +27,17 @@ Nose = Literal["along", "fixed", "four headings"]
 # Directions of the nose: along the track, turned by 90 degrees per leg, or north.
 NOSES: tuple[Nose, ...] = ("along", "four headings", "fixed")
 
-# Distance that routes keep from the border of the area.
+# Smallest distance of routes from the border of the area [m].
 MARGIN_M = 3.0
 
-# Shorter legs are skipped.
+# Shorter legs are skipped [m].
 _LEAST_LEG_M = 40.0
 
-# Smallest spacing of legs.
+# Smallest spacing of legs [m].
 _CLOSEST_M = 15.0
 
 _TURN_STEPS = 8
-# Duration at each of the eight headings of a slow rotation.
+# Time at each of the eight headings of a slow rotation [s].
 _TURN_HOLD_S = 8.0
 
 _TURN_POINTS = 4
@@ -103,7 +103,7 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
     spans[1::2] = [w.hold_s for w in waypoints]
     spans[2::2] = [float(np.linalg.norm(step)) / speed_mps for step in np.diff(place, axis=0)]
     time, yaw = np.cumsum(spans), np.repeat([w.yaw_deg for w in waypoints], 2)
-    # slightly longer, so that the last sample is included if the duration is a full number of seconds
+    # slightly longer, so that the last sample is included if the duration is a whole number of seconds
     seconds = np.arange(0.0, time[-1] + 1e-9, 1.0)
     # a yaw is kept from its waypoint to the next, so each time has the yaw of the waypoint before it
     before = np.maximum(np.searchsorted(time, np.minimum(seconds, time[-1])) - 1, 0)
@@ -157,7 +157,7 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
     legs, up = [], True
     for x in at:
         cut = turned.intersection(shapely.LineString([(x, south - 1.0), (x, north + 1.0)]))
-        # a leg across a hole has several pieces, and one that touches a corner is a point
+        # a leg across a hole consists of several pieces, and a leg that touches a corner is a point
         pieces = [p for p in getattr(cut, "geoms", [cut]) if p.length >= _LEAST_LEG_M]
         pieces.sort(key=lambda p: p.bounds[1], reverse=not up)
         for piece in pieces:
@@ -170,9 +170,9 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
 
 
 def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArray]:
-    """Return the corners of a path between two points of an area. It follows the border where the line is outside."""
+    """Return the corners of a path between two points that stays inside an area, if necessary along its border."""
     line = shapely.LineString([begin, end])
-    # a small buffer, because legs end on the border and may be outside by rounding
+    # add a small buffer, because legs end on the border and may be outside due to rounding
     if area.buffer(0.1).covers(line):
         return []
     corners: list[FloatArray] = []
@@ -257,7 +257,7 @@ class Pattern:
 
 
 def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Route:
-    """Return the densest lawnmower of a pattern within the battery time.
+    """Return the densest lawnmower of a pattern that can be flown within the battery time.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Selection of the rows of a log that are scored, by flags, receiver lock and frozen levels.
 
-Rows are scored unless a flag excludes them.
+All rows are scored unless a flag excludes them.
 
 The receiver of AERPAW's channel sounder is in lock if its quality is near the largest possible value.
 
-A level is frozen if all its digits stay the same while the aircraft moves, because receiver or logger stopped.
+A level is frozen if all its digits stay the same while the aircraft moves, because the receiver or the logger stopped.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def without_values(stream: Stream, path: str) -> InputError | None:
     except InputError as error:
         return error
     value = frame["rss_db" if stream.kind == "rss" else "rank"]
-    # a flagged row without a number is also a measurement: there was no signal or no CSI
+    # a flagged row without a number is also a valid measurement: there was no signal or no CSI
     if value.notna().any() or (frame["flag"] != "").any() or not len(frame):
         return None
     return InputError(
@@ -98,7 +98,7 @@ def may_lose_lock(stream: Stream) -> bool:
         return False
     quality = stream.frame["rss_db"].to_numpy(np.float64)
     locked = quality[quality > _LOST_QUALITY_DB]
-    # in lock it is near its peak, while the SNR of other receivers varies by tens of decibels
+    # in lock, the quality is near its peak, while the SNR of other receivers varies by tens of decibels
     return bool(len(locked)) and abs(float(np.median(locked)) - _LOCK_QUALITY_DB) < 3.0
 
 
@@ -122,7 +122,7 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
     -------
     (n,) or None, str
         Lock state per row of the level (1 in lock, 0 without lock, NaN unknown), and a remark about the times of the
-        quality. None if there is no such quality.
+        quality. None if there is no lock quality.
     """
     if not is_sounder_power(power):
         return None, ""
@@ -140,7 +140,7 @@ def lock_of(power: Stream, candidates: Iterable[Stream]) -> tuple[FloatArray | N
                     "are used, 0.032768 s per row"
                 )
         else:
-            order = np.argsort(at, kind="stable")  # sort, because a log may have been joined from parts
+            order = np.argsort(at, kind="stable")  # parts of a joined log may not be in order of time
             quality = at_times(time, at[order], quality[order], within_s=_WITHIN_S)
         if np.isfinite(quality).any():
             return np.where(np.isfinite(quality), (quality > _LOST_QUALITY_DB).astype(np.float64), np.nan), remark
@@ -152,12 +152,12 @@ def _seconds(stream: Stream) -> FloatArray:
 
 
 FLAG = "level_frozen"
-# A run of equal levels may be frozen above this duration [s], number of samples and flown distance [m].
+# A run of equal levels may be frozen if it exceeds this duration [s], number of samples and flown distance [m].
 _LEAST_S, _LEAST, _LEAST_M = 5.0, 10, 15.0
-# Levels with this resolution repeat in every hover.
+# Levels with this resolution or a coarser one repeat in every hover.
 _COARSE_DB = 0.5
-# A run is not explained by chance if its probability is below this value. The probability follows from the share of
-# equal neighbours in the rest of the series.
+# A run is not due to chance if its probability is below this value. The probability follows from the share of equal
+# neighbours in the rest of the series.
 _CHANCE = 1e-6
 # A level is noisy if its second differences exceed its differences by this factor. For white noise it is the root of 3,
 # for a smooth level it is below 1.
@@ -169,7 +169,7 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
 
     A smooth level can be constant at its maximum or at the end of its scale, and then continue smoothly. It is frozen
     only if it jumps at the end of the run, or if the series ends with the run and had both higher and lower levels
-    before. A noisy level is frozen if chance does not explain the run.
+    before. A noisy level is frozen if the run is not due to chance.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
     """
     out = np.zeros(len(level_db), dtype=np.bool_)
     same = np.diff(level_db) == 0
-    # count distinct levels only, so that a frozen run at a half dB does not make a fine series look coarse
+    # count distinct levels only: a long frozen run at a multiple of 0.5 dB must not make a fine series look coarse
     levels = np.unique(level_db[np.isfinite(level_db)]) / _COARSE_DB
     if same.sum() < _LEAST or (np.abs(levels - np.round(levels)) > 1e-6).mean() < 0.5:
         return out
@@ -217,7 +217,7 @@ def _is_noisy(level_db: FloatArray) -> bool:
     sizes = np.abs(step[step != 0])
     if not len(sizes):
         return False
-    # limit jumps, so that one jump does not make a smooth level noisy
+    # limit jumps, so that a smooth level with one jump does not count as noisy
     first, second = (np.minimum(np.abs(d), _large(d)) for d in (step, np.diff(step)))
     rms, rms_second = float(np.sqrt(np.mean(first**2))), float(np.sqrt(np.mean(second**2)))
     return rms_second > _NOISY * rms and rms > sizes.min()

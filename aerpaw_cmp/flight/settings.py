@@ -178,7 +178,7 @@ class LinkSettings(StrictModel):
     Parameters
     ----------
     bandwidth_hz : float, optional
-        Bandwidth of the receiver. A link is out of coverage below the noise in this bandwidth.
+        Bandwidth of the receiver. A link whose level is below the noise in this bandwidth is out of coverage.
     """
 
     carrier_hz: CarrierHz
@@ -229,7 +229,7 @@ class LinksSettings(StrictModel):
     rank: LinkSettings = LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
-        bandwidth_hz=20e6,  # the noise in the channel of the modem limits the rank, not the noise in 1 Hz
+        bandwidth_hz=20e6,  # the rank is limited by the noise in the modem's channel, not in 1 Hz
         tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
         uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
     )
@@ -277,7 +277,7 @@ class LogSettings(StrictModel):
 
     @property
     def reader_name(self) -> str | None:
-        """The name of the reader, or None if the content of the log shows it. ``columns`` belong to generic_csv."""
+        """The name of the reader, or None if it is detected by content. With ``columns``, it is generic_csv."""
         return self.reader or ("generic_csv" if self.columns else None)
 
     def options(self, timezone: str | None) -> ReadOptions:
@@ -292,7 +292,7 @@ class LogSettings(StrictModel):
 
 
 class Waypoint(StrictModel):
-    """A planned point, ``height_m`` above the ground at the origin. The UAV waits there for ``hold_s`` seconds."""
+    """A planned point at ``height_m`` above the ground at the origin. The UAV waits there for ``hold_s`` seconds."""
 
     label: str = ""
     east_m: float
@@ -302,7 +302,7 @@ class Waypoint(StrictModel):
 
 
 class PlanSettings(StrictModel):
-    """The plan and the true errors of simulated logs. ``aerpaw-cmp simulate`` writes them to truth.json.
+    """The plan of a simulated flight, and the true errors of its logs, which ``simulate`` writes to truth.json.
 
     Parameters
     ----------
@@ -379,7 +379,8 @@ class GroundNode(StrictModel):
     Parameters
     ----------
     track : LogSettings, optional
-        Log with the positions of the node. A node that stays within ``STANDS_STILL_M`` is placed at their median.
+        Log with the positions of the node. A node that stays within ``STANDS_STILL_M`` is placed at the median
+        position.
     height : {"ground", "logged"}
         ``ground``: the antenna is ``antenna_height_m`` above the ground. ``logged``: at the height of the track.
     """
@@ -434,9 +435,10 @@ class RtSettings(StrictModel):
     diffraction : {"none", "edges"}
         Diffraction over one edge of a building. It is included in H, levels and ranks.
     attitude : {"logged", "level", "ignored"}
-        ``logged``: the UAV array rotates with the aircraft. ``level``: with the heading only. ``ignored``: never.
+        ``logged``: the UAV array rotates with the aircraft. ``level``: it rotates with the heading only. ``ignored``:
+        it does not rotate.
     reflection_loss_db : float
-        Additional loss per reflection, for example by rough surfaces. Fit it on other flights.
+        Additional loss per reflection, for example due to rough surfaces. Determine it from other flights.
     """
 
     engine: Literal["image", "sionna"] = "image"
@@ -450,7 +452,7 @@ class RtSettings(StrictModel):
     advanced: AdvancedRt = AdvancedRt()
 
 
-# Widest span of offsets [dB], which are tried in steps of 0.1 dB.
+# Widest search range of offsets [dB]. They are tried in steps of 0.1 dB.
 _WIDEST_DB = 100_000.0
 
 
@@ -460,7 +462,7 @@ class AdvancedRss(StrictModel):
     Parameters
     ----------
     lag_window_s : float
-        Largest clock difference that is searched.
+        Largest clock difference that is searched for [s].
     """
 
     lag_window_s: Annotated[float, Field(ge=0.1, le=3600)] = 15.0
@@ -592,10 +594,10 @@ class FlightFile(StrictModel):
 
     @property
     def rss_attitude(self) -> str:
-        """The attitude with which levels are replayed: ``rt.attitude``.
+        """The value of ``rt.attitude`` with which levels are replayed.
 
-        If the flight file does not state it and an airframe is learned, it is ``logged``, because the gain of an
-        airframe belongs to directions in its own axes.
+        If the flight file does not specify it and an airframe is learned, the value is ``logged``, because the gain of
+        an airframe depends on directions in the axes of the aircraft.
         """
         links = (self.link.rss, *self.link.channels.values())
         learned = any(link.uav.antenna.learned is not None for link in links)
@@ -603,7 +605,7 @@ class FlightFile(StrictModel):
 
     @property
     def rank_rt(self) -> RtSettings:
-        """The settings with which ranks are replayed: ``rt`` as the flight file states it.
+        """The settings with which ranks are replayed: ``rt`` as the flight file specifies it.
 
         A calibration changes ``rt`` only for levels.
         """
@@ -629,9 +631,9 @@ class FlightFile(StrictModel):
         content : mapping
             New values by key.
         cautions : iterable of Caution, optional
-            New warnings about named learned models. None: those of these settings.
+            New warnings about named learned models. None keeps the present warnings.
         learned : mapping of str to Named, optional
-            New learned models by key of ``antennas``. None: those of these settings.
+            New learned models by key of ``antennas``. None keeps the present models.
         lent : iterable of str
             Further channels that this flight may not have.
 
@@ -725,12 +727,12 @@ def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = No
 
 
 def joined(settings: FlightFile, learned: Path) -> FlightFile:
-    """Return the settings of a flight, with those of a calibrated.yaml replacing its own.
+    """Return the settings of a flight, with values replaced by those of a calibrated.yaml.
 
     Parameters
     ----------
     settings : FlightFile
-        Settings with their learned antennas. An antenna of the same end, tower and channel is replaced.
+        Settings of the flight, with learned antennas. An antenna for the same end, tower and channel is replaced.
     learned : Path
         A calibrated.yaml, with its files in the same folder.
 
@@ -743,7 +745,7 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
         check_seal(learned)
     known = files_of(load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True), learned.parent, learned)
     taught: dict[str, Any] = known.get("link", {}).get("channels", {})
-    # only values that the user wrote, because a default must not replace a learned value
+    # use only values that the user wrote, because a default must not replace a learned value
     stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
     # as with overrides, a new channel starts as a copy of the RSS link; learned values then replace its values
     rss_link = settings.link.rss.model_dump(mode="json", exclude_unset=True)
@@ -802,7 +804,7 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
     if not overrides:
         return settings
     plain = settings.model_dump(mode="python")
-    # the originals of copies first, so that the copies have the same values
+    # change the originals of copies first, so that the copies have the same values
     for key in sorted(overrides, key=lambda key: (key.startswith("link.channels."), ".towers." in key)):
         _set(plain, key, overrides[key])
     try:
@@ -832,7 +834,7 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _new_entry(plain: dict[str, Any], holder: dict[str, Any], level: dict[str, Any], parts: list[str], key: str) -> Any:
-    """Return the first content of an entry of a mapping whose keys are free names, or refuse an unknown key."""
+    """Return the initial content of a new entry in a mapping whose keys are free names. Refuse other unknown keys."""
     *above, part = parts
     if above == ["link", "channels"]:
         return deepcopy(plain["link"]["rss"])

@@ -34,9 +34,9 @@ from .replay import replay_poses
 from .settings import FlightFile, LogSettings, PlanSettings, files_of
 from .track import interpolated
 
-# File of the true values.
+# Name of the file of the true values.
 _TRUTH = "truth.json"
-# Flight file, written to the folder of its logs.
+# Name of the flight file that is written next to its logs.
 FLIGHT = "flight.yaml"
 # Readers whose logs can be written.
 _WRITTEN = ("vehicle_out", "sounder_log", "quectel_ri")
@@ -57,7 +57,7 @@ class Trajectory:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last corner."""
+        """Time from the first to the last corner [s]."""
         return float(self.time_s[-1])
 
     def position_at(self, time_s: FloatArray) -> FloatArray:
@@ -66,7 +66,7 @@ class Trajectory:
 
     def velocity_at(self, time_s: FloatArray) -> FloatArray:
         """Return velocities (n, 3) to east, north and up [m/s]. They are zero while the UAV waits."""
-        # the last corner belongs to the last leg
+        # assign the time of the last corner to the last leg
         leg = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
@@ -109,7 +109,7 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
     return Trajectory(np.array(times), np.array(positions, dtype=np.float64))
 
 
-# Tilt of multicopters per speed, without wind. Least squares over nine flights of two airframes gave 0.51 to 0.62.
+# Tilt of multicopters per speed, without wind. Fits to nine flights of two airframes have slopes of 0.51 to 0.62.
 LEAN_DEG_PER_MPS = 0.6
 
 
@@ -138,7 +138,7 @@ def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[F
 def telemetry_frame(
     trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame
 ) -> pd.DataFrame:
-    """Return telemetry records of the trajectory. Altitudes are relative to the first position.
+    """Return telemetry records of the trajectory. Altitudes are relative to the first position of the trajectory.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def correlated_noise(
 def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
     """Return the start in its time zone. Refuse a local time that does not exist or is ambiguous."""
     try:
-        # NaT in both cases, because pandas would raise two kinds of exceptions
+        # request NaT in both cases, because pandas would otherwise raise two kinds of exceptions
         local: Any = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(timezone, ambiguous="NaT", nonexistent="NaT")
         if not 1980 <= start.year <= 2200:
             why = "a year outside 1980 to 2200"
@@ -293,7 +293,7 @@ class FlightSimulator:
         if self.settings.timezone is None:
             raise UsageError("the flight file names no time zone", expected="such as timezone: America/New_York")
         self.plan = plan
-        # the seed includes the name: with equal fading, two flights would be recognised as copies of one log
+        # include the name in the seed: with equal fading, two flights would be recognised as copies of one log
         self.generator = np.random.default_rng([plan.seed, *self.settings.flight.name.encode()])
         self.trajectory = plan_trajectory(plan)
         start = _local_start(plan.start, self.settings.timezone)
@@ -401,7 +401,7 @@ class FlightSimulator:
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )
         out_of_coverage = ~np.isfinite(level) | (level < _LOWEST_DBM)
-        # write times of the tower's clock, with the levels at the true times
+        # the log contains times of the tower's clock, but levels at the true times
         shift = plan.clock_shift_s.get(tower, 0.0)
         self.truth_["rss"].setdefault(tower, {})[str(log.channel)] = {
             "offset_db": offset,
@@ -455,7 +455,7 @@ class FlightSimulator:
         """Insert ``plan.bad_lines`` broken lines at random positions, but not in the first line."""
         lines = data.splitlines(keepends=True)
         count = min(self.plan.bad_lines, len(lines) - 10)
-        # a shorter log would consist mainly of broken lines
+        # do not damage a shorter log, because it would consist mainly of broken lines
         if count == 0 or len(lines) < 20:
             return data, []
         end = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
@@ -464,7 +464,7 @@ class FlightSimulator:
         )
         damage = []
         for number, place in enumerate(places):
-            # a line cut off by a killed logger, or console output
+            # insert a line cut off by a killed logger, or console output
             torn = lines[place].rstrip()[: max(4, len(lines[place]) // 3)]
             text = torn if number % 2 == 0 else b"Killed by signal 15 " + torn[:8]
             lines.insert(place, text + end)

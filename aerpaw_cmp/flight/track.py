@@ -1,8 +1,8 @@
 """Position, height and attitude of the UAV at any time.
 
 Attitude is interpolated as rotation (slerp), never as angles. Telemetry gaps longer than a limit are not bridged, and
-poses inside them are invalid, with a reason. A missing attitude is replaced by level flight along the course, and
-flagged. :class:`TrackAccount` counts every row that is not used.
+poses inside them are invalid, with a reason. A missing attitude is replaced by level flight along the course, and the
+pose is flagged. :class:`TrackAccount` counts every row that is not used.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# returns the height of the ground [m] at east and north coordinates [m], each (n,)
+# A function that returns the height of the ground [m] at east and north coordinates [m], each (n,).
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
 
 # Largest drift of heights above take-off during a flight [m]. Real logs end as low as -3.9 m after landing.
@@ -40,8 +40,8 @@ _DRIFT_M = 5.0
 def raised(up_m: FloatArray, ground_m: FloatArray, takeoff_m: float) -> tuple[FloatArray, BoolArray]:
     """Return heights, raised to just above the ground after a drift, and a mask of poses below the ground.
 
-    A height slightly below the ground is a drift if it is close to the height of the take-off point. Any other height
-    below the ground means that either the height or the ground is wrong.
+    A height slightly below the ground is attributed to drift if it is close to the height of the take-off point. Any
+    other height below the ground means that either the height or the ground is wrong.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
             cause="the log has altitudes, or no positions",
         )
     note = f"no altitude in the log: {log.height_m:g} m above take-off everywhere (height_m)"
-    # omit the reader's warning about the missing height, because height_m supplies it
+    # omit the reader's warning about the missing height, because height_m replaces it
     warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
     return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
 
@@ -128,9 +128,10 @@ def height_in_name(path: str) -> float | None:
 # Longest telemetry gap that is interpolated [s]. Rows of vehicleOut are 1.0 s apart.
 _MAXIMUM_GAP_S = 3.0
 
-# Sparse telemetry is interpolated by straight lines. If nine of ten steps between fixes are at most this long [m] (28 m
-# for 14 s at 2 m/s), all intervals are interpolated. On a faster flight, an interval is interpolated only if one of its
-# ends is this close [m] to the line between the neighbouring fixes. In the field data, nine of ten are within 7.7 m.
+# Sparse telemetry is interpolated by straight lines. If nine of ten steps between fixes are at most this long [m] (a
+# step of 14 s at 2 m/s has 28 m), all intervals are interpolated. On a faster flight, an interval is interpolated only
+# if one of its ends is this close [m] to the line between the neighbouring fixes. In the field data, nine of ten ends
+# are within 7.7 m.
 _SPARSE_APART_M, _SPARSE_ERROR_M = 100.0, 10.0
 
 # In sparse telemetry, an interval longer than this multiple of the usual interval is a gap.
@@ -139,7 +140,7 @@ _SPARSE_GAP = 2.0
 # Below this ground speed the course does not indicate the heading [m/s].
 _COURSE_SPEED_MPS = 1.0
 
-# Number of times whose poses are computed together, which limits the memory on flights over half an hour.
+# Number of times whose poses are computed together. It limits the memory on flights of more than half an hour.
 AT_ONCE = 100_000
 
 # Velocities are computed from the positions this long before and after [s].
@@ -170,7 +171,7 @@ MISREAD = {
 
 @dataclass(frozen=True, slots=True)
 class TrackAccount:
-    """The numbers of telemetry rows that are used, and that are not used, by reason.
+    """The numbers of telemetry rows that are used and, by reason, not used.
 
     Parameters
     ----------
@@ -178,8 +179,8 @@ class TrackAccount:
         Rows of the telemetry frame.
     no_time, duplicate_time, backward_time, bad_position : int
         Rows that are not used for positions, by reason: no time stamp, the same stamp as the row before, an earlier
-        stamp than some row before, or impossible coordinates (including NaN and -999). If it excludes fewer rows,
-        stamps later than some row after them count as backward instead.
+        stamp than some row before, or impossible coordinates (including NaN and -999). If that excludes fewer rows, a
+        row counts as backward if some row after it has an earlier stamp.
     steps_sorted : int
         Number of steps back in time in a shuffled file. Its rows are sorted by time, because that makes the path
         shorter.
@@ -190,15 +191,15 @@ class TrackAccount:
     below_ground : int
         Used rows below the ground plane of the site.
     sparse_s : float
-        Usual interval of sparse telemetry that is interpolated by straight lines [s]; 0 for other telemetry.
+        Usual interval [s] of sparse telemetry, which is interpolated by straight lines. 0 for other telemetry.
     sparse_error_m : (median, 90th percentile)
-        Error of these lines: half the distance of each fix from the line between its neighbours [m].
+        Error of the straight lines [m]: half the distance of each fix from the line between its neighbours.
     gaps : int
         Number of intervals between used rows that exceed the limit.
     longest_gap_s : float
         Longest interval [s].
     hour_steps : int
-        Number of steps of full hours between neighbouring rows, as at a change to or from daylight saving time.
+        Number of time steps of full hours between neighbouring rows, as at a change to or from daylight saving time.
     """
 
     rows: int
@@ -458,7 +459,7 @@ class Track:
         self._course_deg = _courses(self._velocity)
         self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
         turn, yaw = self._attitude[:, :2], self._attitude[:, 2]
-        # a column of zeros is not a heading, because converters write 0 for "unknown"
+        # a column of zeros is not a logged heading, because converters write 0 for "unknown"
         heading_alone = np.isfinite(yaw) & ~np.isfinite(turn).any(axis=1) & bool(np.nan_to_num(yaw).any())
         turn[heading_alone] = 0.0
         known = np.isfinite(self._attitude).all(axis=1) & (np.any(self._attitude != 0.0, axis=1) | heading_alone)
@@ -490,7 +491,7 @@ class Track:
         return len(self._time_s)
 
     def pose_at(self, times: ArrayLike | pd.Series) -> TrackPoses:
-        """Return poses at requested times.
+        """Return the poses at requested times.
 
         Parameters
         ----------
@@ -523,7 +524,7 @@ class Track:
         return other._rotations((nanoseconds(times) - self.start_ns) * 1e-9)[0]
 
     def why_not(self, pose: TrackPoses) -> str:
-        """Return the most frequent reason for times without a pose."""
+        """Return the most frequent reason why times have no pose."""
         reason = REASONS[int(np.bincount(pose.reason_code[~pose.valid], minlength=len(REASONS)).argmax())]
         if reason != "telemetry gap":
             return f"most are {reason}" if reason else "there are no samples"
@@ -565,7 +566,7 @@ class Track:
             return 0.0, turns, (0.0, 0.0)
         part = (interval_s[:-1] / (interval_s[:-1] + interval_s[1:]))[:, None]
         line = (1.0 - part) * self._position[:-2] + part * self._position[2:]
-        # half the distance, because a line between the neighbours of a fix spans two intervals
+        # take half the distance, because a line between the neighbours of a fix spans two intervals
         away_m = 0.5 * np.linalg.norm(line - self._position[1:-1], axis=1)
         if np.quantile(step_m, 0.9) > _SPARSE_APART_M:
             at_ends = np.append(np.inf, away_m), np.append(away_m, np.inf)
@@ -574,7 +575,8 @@ class Track:
             turns, away_m = nearer_m > _SPARSE_ERROR_M, nearer_m[nearer_m <= _SPARSE_ERROR_M]
             if not len(away_m):
                 return 0.0, ~turns, (0.0, 0.0)
-            # use the limit as the second error, because intervals selected by their nearer end look too straight
+            # report the limit as the second error, because intervals that were selected by their nearer end look too
+            # straight
             return usual_s, turns, (float(np.median(away_m)), _SPARSE_ERROR_M)
         return usual_s, turns, (float(np.median(away_m)), float(np.quantile(away_m, 0.9)))
 
@@ -598,7 +600,7 @@ class Track:
         at = self._time_s[self._known]
         near = np.zeros(len(t), dtype=bool)
         if len(at):
-            # attitudes may end before positions and have other gaps
+            # logged attitudes may end before the positions, and have other gaps
             near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, np.diff(at) > self.maximum_gap_s)
         if near.all() and len(t):
             return _slerp(t, at, self._attitude[self._known]), near
@@ -609,7 +611,7 @@ class Track:
 
     def _course_at(self, t: FloatArray) -> FloatArray:
         """Return the course over ground [deg], interpolated as a direction."""
-        # interpolate sine and cosine, because north is between 350 and 10 degrees
+        # interpolate sine and cosine, because the mean of 350 and 10 degrees is north, not 180 degrees
         angle = np.radians(self._course_deg)
         return bearing_deg(interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)])))
 
@@ -643,7 +645,7 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
 
 
 def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
-    """Return logged velocities (east, north, up). Replace missing ones by differences of positions over 4 s.
+    """Return logged velocities (east, north, up). Missing velocities are replaced by differences of positions over 4 s.
 
     Over shorter times, the differences are mainly noise of the positions: at 10 Hz, a hover would have a speed.
     """
@@ -667,7 +669,7 @@ def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1
     span_s : float
         Time before and after [s]. At the ends and next to gaps, only one side is used.
     gap_s : float
-        Longer steps are not bridged [s].
+        Largest time step that is bridged [s].
 
     Returns
     -------
@@ -684,14 +686,14 @@ def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1
 def _differences_mps(t: FloatArray, position_m: FloatArray, span_s: float) -> FloatArray:
     """Return the velocity (n, 3) at ascending times from positions ``span_s``, or one row, before and after."""
     early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
-    # at least one row on each side, because sparse telemetry has no row within the span
+    # use at least one row on each side, because sparse telemetry has no row within the span
     early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
     moved = interpolated(late, t, position_m) - interpolated(early, t, position_m)
     return np.asarray(moved / (late - early)[:, None])
 
 
 def _courses(velocity: FloatArray) -> FloatArray:
-    """Return the course over ground [deg clockwise from north]. At rest, it is the last course, or else the first."""
+    """Return the course over ground [deg clockwise from north]. At rest, keep the course before, or else the first."""
     course = bearing_deg(velocity)
     moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= _COURSE_SPEED_MPS)
     if not len(moving):

@@ -43,7 +43,7 @@ from .settings import FlightFile
 _STEP_S, _MEAN_S, _TREND_S = 0.5, 1.0, 10.0
 _LONGEST_S = 4 * 3600.0  # only the beginning of longer logs is used
 
-# Digits of a change: 7 means unchanged, and dots are half seconds without readings.
+# Digits for the size of a change. 7 means no change, and a dot means half a second without readings.
 _DIGITS, _MIDDLE, _PER_SD, _GAP = "0123456789abcde", 7, 2.5, "."
 
 _BEGIN = "f"
@@ -55,31 +55,31 @@ _SLACK, _HOUR = 120, 7200
 # data, the largest z values of two different logs are 7.3 and 5.7, and the smallest of a changed copy is 8.6.
 _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 
-# Number of changes per run, smallest number of them that are not 0 (constant levels occur in every log), and strides.
-# Because of the strides, a copy with every second to fifth row has the same runs.
+# Number of changes per run, smallest number of changes in a run that are not 0 (constant levels occur in every log),
+# and strides. Because of the strides, a copy with every second to fifth row has the same runs.
 _RUN, _LEAST_CHANGES, _STRIDES = 16, 8, (1, 2, 3, 4, 5)
 
-# Steps of a change [dB]. The second is for logs without changes of the size of the first. The first is not a multiple
-# of 0.1, because changes at the boundary of two steps would depend on rounding errors. Rounding to 0.1 dB leaves a
-# quarter of the runs. Of ten simulated repeats of a flight whose levels differ by 0.2 dB at equal places, none shares
-# two runs.
+# Steps in which changes are counted [dB]. The second step is for logs without changes as large as the first step. The
+# first step is not a multiple of 0.1, because changes at the boundary of two steps would depend on rounding errors.
+# After rounding to 0.1 dB, a quarter of the runs remain. Of ten simulated repeats of a flight whose levels differ by
+# 0.2 dB at equal positions, none shares two runs.
 _CHANGES_DB = (0.51, 0.001)
 
 # A series with fewer different values has no runs, because ranks along one route change similarly on every flight.
 _FEWEST_VALUES = 6
 
-# Number of runs in a fingerprint, and number of common runs that shows one log. A tenth of a log has about 12 of 128
-# runs in common with the log.
+# Number of runs in a fingerprint, and smallest number of common runs of copies of one log. A tenth of a log has about
+# 12 of 128 runs in common with the log.
 _RUNS, _LEAST_SHARED = 128, 3
 
 # Multiplier of the hashes: 2^64 divided by the golden ratio, odd, so that it has an inverse.
 _ODD = 0x9E3779B97F4A7C15
 
-# Positive readings below one, or over more decades than this, are powers.
+# Positive readings are linear powers if all are below 1, or if their range exceeds this ratio.
 _POWER_RATIO = 1e3
 
-# Smallest standard deviation of the changes. With less, a fingerprint would describe only the route. Real logs have
-# 0.26 or more.
+# Smallest standard deviation of the changes. With a smaller value, a fingerprint would describe only the route. Real
+# logs have 0.26 or more.
 _LEAST_SD = 0.2
 
 
@@ -89,7 +89,7 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     The fingerprint is empty for readings with too few changes and for periodic readings.
     """
     known = np.flatnonzero(np.isfinite(readings) & ~np.isnat(time))
-    # a stable sort, because a fingerprint must not depend on the order of equal times
+    # use a stable sort, because otherwise the order of equal times, and with it the fingerprint, would vary
     known = known[np.argsort(time[known], kind="stable")]
     if not len(known):
         return ""
@@ -110,7 +110,7 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     if len(change) < _FEWEST or not change.std() > _LEAST_SD:
         return ""
     spread = 1.4826 * float(np.median(np.abs(change)))
-    # use the standard deviation if the median is about 0, as for ranks
+    # use the standard deviation if the robust estimate is about 0, as for ranks
     spread = spread if spread > 0.05 * change.std() else float(change.std())
     digits = np.clip(np.rint(change / spread * _PER_SD) + _MIDDLE, 0, len(_DIGITS) - 1).astype(np.int64)
     text = np.full(len(at), _GAP)
@@ -188,7 +188,7 @@ def _parts(mark: str) -> tuple[int | None, str, frozenset[str]]:
 
 def _evidence(first: str, second: str) -> FloatArray:
     """Return Fisher's z relative to its SD at each circular lag, or 0 if pairs are few or weakly correlated."""
-    # zero padding, so that all lags in both directions fit
+    # pad with zeros, so that all lags in both directions fit
     size = 1 << (len(first) + len(second) - 1).bit_length()
     left, right = _spectra(first, size), _spectra(second, size)
 
@@ -242,7 +242,8 @@ def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[Measure
     folder : Path
         Folder of the antenna files and of calibrations.
     site : str or Path
-        Site with learned tables. If the file of an antenna does not name its logs, the same table is searched there.
+        Site with learned tables. If the file of an antenna does not name its training logs, a table with the same gains
+        is searched for there.
 
     Returns
     -------
@@ -292,10 +293,11 @@ def marks_of(flights: Iterable[FlightData]) -> tuple[str, ...]:
 def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePattern | None:
     """Return the learned table with the same gains as an antenna whose file does not name its logs, or None.
 
-    It is searched among the learned tables of the site and of packaged sites, and the calibrations in the folder.
+    The table is searched for among the learned tables of the site and of packaged sites, and the calibrations in the
+    folder.
     """
     packaged = folder_of("lake_wheeler").parent.glob("*.learned/*.csv.gz")
-    # the site's learned tables first, because most antennas are found there
+    # search the site's learned tables first, because most antennas are found there
     places = dict.fromkeys([*memory.glob("*.csv.gz"), *packaged, *folder.glob("*.csv"), *folder.glob("*/*.csv")])
     tables = (table for place in places if (table := _learned_table(place)) is not None)
     return next((table for table in tables if _same_numbers(pattern, table)), None)
@@ -303,7 +305,7 @@ def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePat
 
 @lru_cache(maxsize=64)
 def _learned_table(place: Path) -> SpherePattern | None:
-    """Return the learned table in a file, or None if the file is not one."""
+    """Return the learned table in a file, or None if the file is not a learned table."""
     with suppress(InputError, OSError, EOFError, zlib.error):
         with gzip.open(place) if place.suffix == ".gz" else place.open("rb") as book:
             learned = book.read(len(LEARNED)) == LEARNED.encode()

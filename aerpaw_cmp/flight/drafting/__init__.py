@@ -1,1 +1,1 @@
-"""A first flight.yaml from logs alone."""
+"""A first flight.yaml, drafted from logs alone."""

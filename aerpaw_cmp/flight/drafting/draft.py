@@ -63,7 +63,7 @@ class DryRun:
     refused : str
         The message with which a report would stop. Empty if it would run.
     lost : tuple of str
-        Series of which less than half of the samples are compared, each with the reason.
+        Series with less than half of their samples compared, each with the reason.
     data : FlightData or None
         The gathered flight, or None if the report would stop.
     """
@@ -100,7 +100,7 @@ def dry_run(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) -
 
 
 def _counts(place: FloatArray, known: BoolArray, value: FloatArray, lowest_m: float | None) -> tuple[int, int, int]:
-    """Return the numbers of samples with a value, with a value and a position, and with both and enough height."""
+    """Return the numbers of samples with a value, with a value and a position, and with both at a sufficient height."""
     valued = np.isfinite(value)
     placed = valued & known
     high = placed if lowest_m is None else placed & (place[:, 2] >= lowest_m)
@@ -184,7 +184,7 @@ def draft(
     Returns
     -------
     str, list of str
-        The text, and remarks on what the user should check and on what is not used.
+        The text, and remarks about what the user should check and what is not used.
 
     Raises
     ------
@@ -214,7 +214,7 @@ def draft(
     if not kinds & {"rss", "rank"}:
         # a table of positions may contain levels under an unknown name, which its warnings list
         unread = [text for file in files for text in file.result.warnings if "--map" in text]
-        # do not list unused tracks, because they do not explain why there is no level
+        # do not list unused tracks, because they are not the reason why there is no level
         radio = [line for line in lines if any(s.kind != "telemetry" for s in line.file.result.streams)]
         reasons = unread + sorted(remark for line in radio for remark in line.remarks)
         raise UsageError(
@@ -226,7 +226,7 @@ def draft(
 
     def text_with(known: Proposal) -> str:
         logs = [line.with_receiver(known.receivers.get(number)) for number, line in enumerate(used)]
-        # a log that is not used may have determined the place of a node that other logs share
+        # include logs that are not used: one of them may have determined the position of a node that other logs share
         parts = _first_lines(name, [*(line for line in lines if not line.entry), *logs], out, context)
         learned_lines = _learned_lines(known, link) if "rss" in kinds else []
         rank = [RANK] if "rank" in kinds else []
@@ -236,7 +236,7 @@ def draft(
     proof = _proof(text_with(Proposal()), folder, [line.file for line in used])
     known, remarks = _learned_antennas(lines, context, proof.data)
     text = text_with(known)
-    parse_yaml(text, FlightFile)  # an error here is a bug of this module
+    parse_yaml(text, FlightFile)  # an error here is a bug in this module
     if proof.reason:
         text = text.replace(HEAD, f"{HEAD}# No sample of this draft can be compared: {proof.reason}.\n", 1)
     # questions are at the ends of lines, so that a search in the file finds them
@@ -300,15 +300,15 @@ class Draft:
 def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions()) -> list[Draft]:
     """Return a flight.yaml for each flight of the logs, in the order of time.
 
-    If only one flight is complete (levels or ranks, and positions), its draft lists all logs, and names those that it
-    does not use. See :func:`draft`.
+    If only one flight is complete (levels or ranks, and positions), its draft lists all logs and marks those that are
+    not used. See :func:`draft`.
 
     Parameters
     ----------
     files : sequence of IngestedFile
         Logs of one or several flights.
     folder : Path
-        Folder of the drafts. Paths in them are relative to it.
+        Folder of the drafts. Paths in the drafts are relative to this folder.
     options : DraftOptions
 
     Returns
@@ -359,7 +359,7 @@ def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, LoggedFlight]:
     named: dict[str, LoggedFlight] = {}
     for flight in complete or [Flight(list(files))]:
         name = _name(_flown(flight.files), flight.files)
-        # two flights started in the same minute, or the folder has no times
+        # two flights may have started in the same minute, or logs without times may share a folder
         taken = sum(other == name or other.startswith(f"{name}_") for other in named)
         name = f"{name}_{taken + 1}" if taken else name
         # if one flight is complete, its draft lists all other logs as not used
@@ -368,7 +368,8 @@ def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, LoggedFlight]:
     return named
 
 
-# Lower samples are take-off, landing and waiting: at 2 m the airframe, its pilot and the grass determine the level.
+# Lower samples are from take-off, landing and waiting: at a height of 2 m, the airframe, its pilot and the grass
+# determine the level.
 MINIMUM_HEIGHT_M = 5
 
 # Take-off and landing are excluded only from a flight that reached this height [m].
@@ -387,7 +388,7 @@ _SURE_M = 100.0
 
 
 def _learned_antennas(lines: Sequence[_Line], context: _Context, data: FlightData | None) -> tuple[Proposal, list[str]]:
-    """Return the learned antennas that fit, or an empty proposal and a remark if they cannot be read."""
+    """Return the learned antennas that fit, or an empty proposal and a remark if the models cannot be read."""
     if data is None:
         return Proposal(), []
     site = context.options.site
@@ -411,7 +412,7 @@ def _bandwidth_mhz(paths: Sequence[str]) -> float:
     >>> _bandwidth_mhz(["a/40m_fs5MHz.mat"]), _bandwidth_mhz(["a/log.txt"]), _bandwidth_mhz(["fs5MHz/a", "fs10MHz/a"])
     (5.0, 20.0, 20.0)
     """
-    # the last name counts: a folder of several rates contains folders of one rate
+    # use the last rate in a path: a folder of several rates contains a folder per rate
     rates = {float(found[-1]) for path in paths if (found := _SAMPLING_RATE.findall(str(path)))}
     return rates.pop() if len(rates) == 1 else _SOUNDER_MHZ
 
@@ -482,7 +483,8 @@ def _replay_lines(lines: Sequence[_Line], context: _Context, known: Proposal) ->
     return [*why, line]
 
 
-# Number of positions whose sight lines are tested, and the share of blocked lines from which woods or buildings count.
+# Number of positions whose sight lines are tested, and the share of blocked lines above which woods or buildings
+# matter.
 _SIGHTS, _SHADED_SHARE = 200, 0.01
 
 
@@ -560,7 +562,7 @@ def floor_of(level: Stream, *, locks: bool) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Context:
-    """The flight, its site and the options, which are equal for all logs of a draft.
+    """The flight, its site and the options, which are the same for all logs of a draft.
 
     Parameters
     ----------
@@ -568,7 +570,7 @@ class _Context:
         Folder of flight.yaml.
     options : DraftOptions
     flown : (Stream, Span), optional
-        The telemetry that is the track, and its time span.
+        The telemetry that is used as the track, and its time span.
     which : str
         Question about the vehicle, empty if only one flew.
     unsure : mapping of str to str
@@ -601,7 +603,7 @@ class _Context:
 
     @property
     def track(self) -> Stream | None:
-        """The telemetry that is the track."""
+        """The telemetry that is used as the track."""
         return None if self.flown is None else self.flown[0]
 
     def leads(self, file: IngestedFile) -> bool:
@@ -625,7 +627,7 @@ class _Context:
         return None if span is None else (span[0] + shift, span[1] + shift)
 
     def is_utc(self, file: IngestedFile) -> bool:
-        """Check whether a log without a zone overlaps the telemetry as UTC and not as local time."""
+        """Check whether a log without a zone overlaps the telemetry if its times are UTC, but not if they are local."""
         return any(self.shift(stream) for stream in file.result.streams)
 
     def dated(self, stream: Stream, origin: Origin | None) -> Stream:
@@ -681,13 +683,14 @@ class _Line:
 
 
 def _lines(files: Sequence[IngestedFile], context: _Context) -> list[_Line]:
-    """Return a line per log, telemetry first and the others in the order of the files."""
+    """Return a line per log: telemetry first, then all other logs in the order of the files."""
     lines: list[_Line] = []
 
     def samples(file: IngestedFile) -> int:
         return sum(len(s.frame) for s in file.result.streams if s.kind != "telemetry")
 
-    # the first of several copies is used: that on the telemetry's clock, then that with the most samples
+    # the first of several copies is used, so sort copies on the telemetry's clock, then copies with more samples, to
+    # the front
     for file in sorted(files, key=lambda f: (not context.leads(f), context.is_utc(f), -samples(f))):
         lines.append(_line(file, context, lines))
     order = {file.path: number for number, file in enumerate(files)}
@@ -705,7 +708,7 @@ def _line(file: IngestedFile, context: _Context, earlier: Sequence[_Line]) -> _L
     if any("\ud800" <= letter <= "\udfff" for letter in path):  # bytes that are not UTF-8, as Python represents them
         remark = f"{shown}: flight.yaml cannot contain a name that is not UTF-8; rename the file"
         return _Line(file=file, shown=shown, remarks=(remark,))
-    streams = [s for s in file.result.streams if s.kind != "kpi"]  # reports do not compare kpis
+    streams = [s for s in file.result.streams if s.kind != "kpi"]  # reports do not compare KPIs
     origin = None if context.options.time_origin else _origin(streams, context.flown)
     entry, comment, places = _with_node(file, path, streams, origin, context, earlier)
     if context.is_utc(file):
@@ -761,7 +764,7 @@ def _heights_and_floor(compared: Sequence[Stream], path: str, track: Stream | No
             "no altitude in the log: what is height_m?" if height is None else "height_m from the file's name?"
         )
     if (floor := receiver_floor_db([s for s in compared if s.kind == "rss"])) is not None:
-        # a hundredth above, because levels at or below floor_db are out of coverage
+        # a hundredth above the floor, because levels at or below floor_db are out of coverage
         keys["floor_db"] = round(floor + 0.01, 2)
         asked.append(f"floor of the receiver at {floor:.1f} dB?")
     if any(is_ratio(s) for s in compared):
@@ -871,7 +874,7 @@ def _refused(
         if s.kind != "telemetry"
     ]
     refused = {}
-    # of two ranks in a log, the one with more values is used
+    # of several ranks in a log, use the one with the most values
     for stream in sorted(streams, key=_missing):
         span, key = context.span(stream), _key(stream, entry)
         if span is None:
@@ -892,13 +895,13 @@ def _refused(
     return refused
 
 
-# Means over this time [s] show whether two logs have the same readings, in any form: their difference then has a
-# standard deviation below this [dB]. That of the levels of two antennas is some decibels.
+# Two logs contain the same measurement, in whatever form, if the difference of their means over this time [s] has a
+# standard deviation below this [dB]. For the levels of two antennas, it is some decibels.
 _MEANS_S, _OTHER_READINGS_DB = 2.0, 1.0
 
 
 def _another_channel(streams: Sequence[Stream], entry: Mapping[str, Any], earlier: Sequence[_Line]) -> str:
-    """Return a name for the channel of a log whose tower has other readings of the same name at the same time.
+    """Return a channel name for a log if another log has different levels of the same tower and name at the same time.
 
     It is empty for logs that name their channel or have cells, and for the first log and its copies.
     """
@@ -964,10 +967,10 @@ def _missing(stream: Stream) -> int:
 
 
 def _leading(streams: Sequence[Stream]) -> dict[str, str]:
-    """Return the streams with another quantity of a receiver and cell than its RSRP, with the name of the RSRP."""
+    """Return the streams with other quantities of a receiver and cell that also has RSRP, with the name of the RSRP."""
     leaders: dict[object, str] = {}
     same = {}
-    # RSRP first, because RSSI and wideband power of a cell include its load and its neighbours
+    # prefer RSRP, because RSSI and wideband power of a cell also contain its load and its neighbours
     for stream in sorted(streams, key=lambda s: s.attributes.get("quantity") != "RSRP"):
         if stream.kind != "rss" or "quantity" not in stream.attributes:
             continue
@@ -1007,7 +1010,7 @@ def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None)
 
 
 def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
-    """Return the telemetry that overlaps most levels and ranks, and its time span. In a tie it is the longest one."""
+    """Return the telemetry that overlaps most levels and ranks, and its time span. In a tie, return the longest."""
     timed = [(stream, span, file) for file in files for stream in file.result.streams if (span := stream_span(stream))]
     measured = [span for s, span, _ in timed if s.kind != "telemetry" and has_wall_clock(span[0])]
     tracks = [(s, span, file) for s, span, file in timed if s.kind == "telemetry"]
@@ -1021,11 +1024,11 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
         return sum(meet(flight[1], span) for span in measured), flight[1][1] - flight[1][0]
 
-    # without a wall clock, a log with both levels and positions is a flight on its own clock
+    # if no telemetry has a wall clock, a log with both levels and positions is a flight with relative times
     return max(telemetry or relative[:1], key=worth, default=None)
 
 
-# Logs of one aircraft by its autopilot and by another program differ by less than this [m].
+# Positions of one aircraft in the logs of its autopilot and of another program differ by less than this [m].
 _ONE_VEHICLE_M = 30.0
 
 # Log evidence per bin by which the levels must fit one vehicle better.
@@ -1056,7 +1059,7 @@ def _carrier(
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
     evidence = [max((NodeFinder(site, s).evidence(level) for level in levels), default=-np.inf) for s, _ in tracks]
     order = np.argsort(evidence)
-    # all must have evidence, because a track without levels does not exclude another
+    # every vehicle must have evidence: a track without levels does not show that another vehicle carried the radio
     sure = np.isfinite(evidence).all() and evidence[order[-1]] - evidence[order[-2]] > _SURE_OF_VEHICLE
     best = tracks[order[-1]] if sure else flown
     named = " and ".join(stream.name for stream, _ in tracks)
@@ -1076,7 +1079,8 @@ def _apart_m(first: Stream, second: Stream) -> float:
     return float(np.median(np.linalg.norm(here - there, axis=1))) if both.any() else 0.0
 
 
-# Largest number of cells that are proposed, those with the most samples. In a city a phone reports a hundred cells.
+# Largest number of cells that are proposed. In a city, a phone reports a hundred cells, so only those with the most
+# samples are proposed.
 MOST_CELLS = 6
 
 
@@ -1101,13 +1105,14 @@ def _cells(streams: Sequence[Stream]) -> list[int | str]:
 
 
 def _entry(file: IngestedFile, path: str, towers: Sequence[str], shared: Path) -> tuple[dict[str, Any], str]:
-    """Return the keys of a log and a question about its node, if that is a guess."""
+    """Return the keys of a log and, if the node is a guess, a question about it."""
     entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
     need = [s for s in file.result.streams if s.kind in ("rss", "rank") and not s.attributes.get("node")]
     if not need:
         return entry, ""
     here = Path(file.path).resolve()
-    # a home folder may have the name of a tower: only the file, its folder, and folders below the draft or among logs
+    # a home folder may have the name of a tower: search only the names of the file, its folder, and folders below the
+    # draft or the common folder of the logs
     below = str(here.relative_to(shared)) if path.startswith(("/", "..")) else path
     near = named_tower("/".join(here.parts[-2:]), towers) or named_tower(below, towers)
     alone = towers[0] if len(towers) == 1 else None
@@ -1155,7 +1160,8 @@ def _flow(entry: dict[str, Any]) -> str:
     return text if as_read else dumped('"')
 
 
-# Earlier times are not used in the name of a flight, because they are relative or from a clock that was never set.
+# Earlier times are not used in the name of a flight, because they are relative, or come from a clock that was never
+# set.
 _FIRST_CLOCK = np.datetime64("1981")
 
 

@@ -55,24 +55,26 @@ from ..settings import FlightFile
 from ..track import Track
 from ..training import among, flight_logs, logs_of, marks_of, series_mark
 
-# Smallest log odds of a tower, and of a listed position. At LW1, 18 of 20 real flights and thirds have more than -0.5
-# and all have more than -3. For six rovers, towers have -11 and less, and the listed positions have -3 and more.
+# Smallest log odds of a tower, and of a listed position. Of 20 real flights at LW1 and thirds of them, 18 have more
+# than -0.5 and all have more than -3. For six rovers, the log odds of towers are -11 or less, and those of the listed
+# positions -3 or more.
 _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
-# Log odds that learned antennas must add. Thirds of LW1 flights have 8 to 57 with antennas from one or two flights.
-# At 158 of 165 positions elsewhere, they add less than 5, so that the log odds stay below those of a tower.
+# Log odds that learned antennas must add. For thirds of LW1 flights, antennas from one or two flights add 8 to 57. At
+# 158 of 165 positions elsewhere, they add less than 5, and the log odds stay below those of a tower.
 _LEARNED_MORE = 5.5
 
-# Log evidence by which the levels must fit another tower better than the one that a name specifies.
+# Log evidence by which the levels must fit another tower better than the tower in the name of the log.
 CONTRADICTED = 8.0
 
-# Smallest number of bins of a level by which the vehicle that carried the radio is chosen, and the model of the level.
+# Smallest number of bins of a level from which the vehicle that carried the radio is chosen, and the model of the
+# level.
 _FEWEST_OF_VEHICLE = 8
 _NEAR_FREE_SPACE = LevelModel(
     slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, cases=(Case(shadow_db=2.0, scatter_db=1.5, time_s=30.0),)
 )
 
-# Positions and towers whose log odds differ by less are all named.
+# If the log odds of positions and towers differ by less than this, all of them are named.
 _UNDECIDED = 3.0
 
 # Carrier and power of the link that a draft proposes.
@@ -123,13 +125,14 @@ class Placement:
     ----------
     node : str
     tower : mapping or None
-        Entry of ``towers`` in flight.yaml. None for a tower of the site, and for a node that an earlier log has.
+        Entry of ``towers`` in flight.yaml. None for a tower of the site, and for a node that was proposed for an
+        earlier log.
     question : str
         Question about the proposal.
     radius_m : float
         Radius of the 90 % region of an estimated position, or 0 for a known position [m].
     position_m : (3,), optional
-        East, north and up of a node that the site does not have [m]. None if an earlier log has it.
+        East, north and up of a node that is not in the site [m]. None if it was proposed for an earlier log.
     """
 
     node: str
@@ -179,7 +182,7 @@ class NodeFinder:
         """Return about ``count`` positions (n, 3) of the flight in the air [m], at equal steps of rows."""
         times = self.telemetry.frame["time"]
         place = self.track.pose_at(times.iloc[spread_out(len(times), count)]).position_m
-        # on the ground every sight line is blocked
+        # omit positions on the ground, where every sight line is blocked
         return place[place[:, 2] > self.track.ground_m + _LOW_M]
 
     def levels(self, stream: Stream, floor_db: float = -np.inf) -> LevelTrack:
@@ -234,7 +237,7 @@ class NodeFinder:
             track = with_antennas(track, known_airframe)
             odds = place_odds(track, np.array(at))
         odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
-        # only for learned antennas, or if no tower fits, because the search is the slowest step
+        # search only for learned antennas, or if no tower fits, because the search is the slowest step
         estimate = locate(track) if any(antennas.values()) or odds_tower.max() < _TOWER_ODDS else None
         known = np.full(len(towers), -np.inf)
         for i, tower in enumerate(towers):
@@ -244,12 +247,12 @@ class NodeFinder:
                 learned_odds = max(self._learned_odds(track, tower.name, each) for each in fitting) - np.log(
                     len(fitting)
                 )
-                # relative to any position, like all other odds
+                # make the odds relative to any position, like all other odds
                 learned_odds -= estimate.anywhere + _LEARNED_MORE
                 known[i] = learned_odds if learned_odds >= _TOWER_ODDS else -np.inf
                 odds_tower[i] = max(odds_tower[i], learned_odds)
         if len(listed) and odds_listed.max() >= max(_LISTED_ODDS, odds_tower.max()):
-            # positions in a list can be some metres apart: name all likely lines
+            # positions in a list can be only some metres apart: name all likely lines
             order = np.argsort(-odds_listed)
             place, least = listed[order[0]], odds_listed[order[0]] - _UNDECIDED
             undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]
@@ -261,7 +264,7 @@ class NodeFinder:
         if odds_tower[best] >= _TOWER_ODDS:
             near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
             alike = [towers[i].name for i in near]
-            # part of a flight can fit several towers: one with learned antennas is the most likely
+            # a part of a flight can fit several towers. A tower with learned antennas is then the most likely.
             name = towers[max(near, key=lambda i: (known[i], towers[i].name in antennas))].name
             asked = "is it this tower?" if len(alike) == 1 else f"is it {name}?"
             fits = (
@@ -350,7 +353,7 @@ class NodeFinder:
         return bool(np.hypot(east[0] - start[0], north[0] - start[1]) < NEAR_M)
 
 
-# Two channels of one rover are placed some metres apart.
+# The estimated positions of two channels of one rover are within this distance [m].
 _SAME_NODE_M = 100.0
 
 
@@ -376,7 +379,7 @@ def with_antennas(
 def _gain_of(
     airframe: MeasuredPattern, node: MeasuredPattern | None
 ) -> Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-    """Return the gain of an airframe and of a node with its standard deviation, as ``LevelTrack.airframe_db``."""
+    """Return a function for ``LevelTrack.airframe_db``: the gain of airframe and node, and its standard deviation."""
 
     def gain_db(at_uav: FloatArray, at_node: FloatArray) -> tuple[FloatArray, FloatArray]:
         gain, square = np.zeros((2, *at_uav.shape[:-1]))
@@ -410,12 +413,12 @@ class LearnedLink:
 
     @property
     def receiver(self) -> str:
-        """Name of the receiver of its levels: that of the training flights, or the name of the entry."""
+        """Name of the receiver of the levels: the receiver of the training flights, or else the name of the entry."""
         return self.series.receiver or self.name
 
     @property
     def level(self) -> learned.LearnedLevel:
-        """The learned level. Only for series that have it."""
+        """The learned level. Use it only for a series with a learned level."""
         assert self.series.level is not None
         return self.series.level
 
@@ -443,7 +446,7 @@ class LearnedLink:
     def airframe_is_general(self) -> bool:
         """True if the airframe can be used at other towers.
 
-        This requires a receiver that keeps its lock, and flights that predict each other.
+        This requires a receiver that keeps its lock, and training flights that predict each other.
         """
         return self.series.lock is None and self.series.shares_airframe
 
@@ -477,7 +480,7 @@ def _process(pattern: SpherePattern, known: DirectionCovariance, term: gains.Ter
 
 
 def all_learned_links(site: str | Path) -> list[LearnedLink]:
-    """Return the learned antennas of a site, of all entries, the latest entry last.
+    """Return the learned antennas of all entries of a site, the latest entry last.
 
     Raises
     ------
@@ -512,7 +515,7 @@ def latest_learned_links(site: str | Path) -> dict[str, LearnedLink]:
     Raises
     ------
     UsageError, InputError
-        As :func:`all_learned_links`.
+        For the same reasons as :func:`all_learned_links`.
     """
     return {f"{known.series.tower}.{known.series.channel}": known for known in all_learned_links(site)}
 
@@ -529,9 +532,9 @@ class Receiver:
     Parameters
     ----------
     name : str
-        Name for ``receiver:`` of the log, or an empty text if no receiver fits.
+        Value of ``receiver:`` of the log, or an empty text if no receiver fits.
     about : str
-        Its odds, or a question about it, for the end of a comment.
+        Odds of the receiver, or a question about it, for the end of a comment.
     """
 
     name: str
@@ -545,7 +548,7 @@ class Proposal:
     Parameters
     ----------
     antennas_about : str
-        Source and odds of the antennas, or the odds of the best ones if none fit.
+        Source and odds of the antennas, or the odds of the best antennas if none fit.
     receiver : str, optional
         Receiver of the rank.
     receivers : mapping of int to Receiver
@@ -562,7 +565,7 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nodes:
-    """Nodes outside the site's towers at well-known positions, and the towers of the site."""
+    """Nodes at well-known positions that are not towers of the site, and the towers of the site."""
 
     placed: frozenset[str] = frozenset()
     fixed: Sequence[str] = ()
@@ -579,11 +582,11 @@ def propose(
     Parameters
     ----------
     data : FlightData
-        Without learned antennas.
+        The flight, without learned antennas.
     place : str or Path
         The site, as an argument of :func:`.read_learned`.
     site : str
-        Its name in the names of the antennas.
+        Name of the site, as it appears in the names of the antennas.
     nodes : Nodes
     carrier_known : bool
         True if the carriers of ``data`` are correct. Antennas of other bands are then not compared.
@@ -621,7 +624,7 @@ def propose(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Chosen:
-    """The learned antennas of both ends of one entry that the levels support best, by ``tower.channel``."""
+    """The learned antennas of both ends that the levels support best, all from one entry, by ``tower.channel``."""
 
     antennas: Mapping[str, LearnedLink]
     odds: gains.Evidence
@@ -657,13 +660,13 @@ def _antennas_for(
     general = {item.series.uav_file: item for item in known if item.airframe_is_general}.values()
     tried: dict[str, list[tuple[str, LearnedLink, gains.Evidence]]] = {}
     for number, series in enumerate(levels):
-        # the same alternatives for all antennas, because their odds are compared with each other
+        # use the same alternatives for all antennas, because their odds are compared with each other
         alone = (evidence.with_airframe(number, a.airframe) for a in general if _in_band(a, series, bands[1]))
         most_alone = max(alone, default=-math.inf)
         for item in known:
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, bands[0]):
                 continue
-            # antennas that do not predict other flights are not offered to a receiver with another unit
+            # do not propose antennas that do not predict other flights to a receiver with another unit
             if _unit_odds(series, item) < 0.0 and not item.airframe_is_general:
                 continue
             named_odds = _named_odds(data, series, item, receivers)
@@ -673,7 +676,7 @@ def _antennas_for(
             odds = replace(odds, over_own=odds.over_own + named_odds)
             if odds.over_own > 0.0:
                 tried.setdefault(item.name, []).append((f"{series.tower}.{series.channel}", item, odds))
-    # judge the channels of a flight together: they need antennas of one entry, with one airframe
+    # judge the channels of a flight together: their antennas must come from one entry, with one airframe
     fits = [_one_each(each) for each in tried.values()]
     chosen = max(fits, key=lambda fit: sum(odds.over_own for _, odds in fit.values()), default={})
     over = [(odds.over_own, odds.over_turned) for _, odds in chosen.values()]
@@ -699,14 +702,15 @@ def _one_each(
     return chosen
 
 
-# Standard deviation of the level of an unknown receiver [dB], and of the gains of both ends if they are not known.
+# Standard deviation of the level of an unknown receiver [dB], and of the unknown gains of both ends.
 _UNKNOWN_LEVEL_DB = 30.0
 _UNKNOWN_GAINS_DB = math.hypot(gains.BODY.sd_db, gains.MAST.sd_db, gains.PAIR.sd_db)
 
-# Log odds of the receiver of learned antennas that the levels support, and of one that loses its lock as the log does.
+# Log odds for the receiver of the learned antennas that the levels support, and for a receiver that loses its lock if
+# the log does.
 _ITS_ANTENNAS = _ITS_LOCK = 5.0
 
-# Share of samples without lock that a receiver which always keeps its lock does not have.
+# If the share of samples without lock is larger than this, the receiver loses its lock.
 _LOST_SHARE = 0.01
 
 
@@ -715,8 +719,8 @@ def _receivers(
 ) -> dict[int, Receiver]:
     """Return the learned receiver of the levels of each log, or the question for it, by the number of the log.
 
-    A receiver is recognised by its level above free space, its unit, its loss of lock and its antennas. A question is
-    asked only if its antennas are proposed and its level differs.
+    A receiver is recognised by its level above free space, its unit, its loss of lock and its antennas. There is a
+    question only if the antennas of a receiver are proposed and its level differs.
     """
     odds: dict[int, dict[str, float]] = {}
     words: dict[tuple[int, str], str] = {}
@@ -747,7 +751,7 @@ def _receivers(
 def _receiver_odds(
     series: RssSeries, observed: Observed, item: LearnedLink, antenna: LearnedLink | None
 ) -> tuple[float, str]:
-    """Return the log odds that levels are those of the receiver of an item, and the words for its level."""
+    """Return the log odds that levels were measured by the receiver of an item, and a phrase about its level."""
     level, lock, samples = item.level, item.series.lock, observed.samples
     if observed.locked is not None:
         samples = samples.part(np.asarray(observed.locked != 0.0))
@@ -794,8 +798,8 @@ def _airframe_for(
     )
 
 
-# Prior log odds of antennas of both ends, with the same names of tower and channel or the same receiver, and those of a
-# receiver with levels in another unit. Levels of field flights add 13 and more, so they can outweigh equal names.
+# Prior log odds of antennas of both ends with the same names of tower and channel or the same receiver. Prior log odds
+# of a receiver with levels in another unit. Levels of field flights add 13 and more, so they can outweigh equal names.
 # Levels of a short or smooth flight cannot. The unit depends on the receiver and not on the antennas.
 _SAME_NAME, _OTHER_UNIT = 10.0, -3.0
 
@@ -804,7 +808,7 @@ _MOUNTED_AS_LEARNED = 3.0
 
 
 def _named_odds(data: FlightData, series: RssSeries, item: LearnedLink, receivers: Container[str]) -> float:
-    """Return the log odds that the names of receiver, tower and channel give to learned antennas of both ends."""
+    """Return the log odds of learned antennas of both ends from the names of receiver, tower and channel."""
     receiver = data.settings.logs[int(series.log[0])].receiver if len(series.log) else ""
     if receiver in receivers:
         return _SAME_NAME if receiver == item.receiver else -math.inf
@@ -823,7 +827,7 @@ def _in_band(item: LearnedLink, series: RssSeries, band: float) -> bool:
     return abs(series.link.carrier_hz / item.series.carrier_hz - 1.0) <= band
 
 
-# Larger odds are shown as "more than", and smaller odds than its inverse as "less than".
+# Odds above this are shown as "more than", and odds below 1 / this as "less than".
 _MOST_ODDS = 1000.0
 
 
@@ -852,24 +856,24 @@ def _ratio(nat: float) -> str:
     return beyond + (f"{for_one:.0f}:1" if nat > 0.0 else f"1:{for_one:.0f}")
 
 
-# Assumptions about the scatter of the levels of a node at an unknown place, with an unknown gain of the airframe.
+# Assumptions about the scatter of the levels of a node at an unknown position, with an unknown gain of the airframe.
 _SCATTERS = tuple(
     Case(shadow_db=shadow, scatter_db=scatter, length_m=45.0, azimuth_db=0.8, airframe_db=1.5)
     for shadow, scatter in ((8.0, 4.0), (2.5, 2.0))
 )
 
-# Airframes are compared at the likeliest places of a grid that reaches this far beyond the track [m]. Each place is
-# divided by three to the east and to the north.
+# Airframes are compared at the likeliest positions of a grid that reaches this far beyond the track [m]. Around each of
+# them, the spacing is divided by three to the east and to the north.
 _BEYOND_M, _PER_SIDE, _LIKELIEST = 400.0, 24, 10
 
 
 def searching_airframe(
     site: str | Path, log: tuple[str, str], track: LevelTrack, carrier_hz: float | None = None
 ) -> SpherePattern | None:
-    """Return the learned airframe that levels of a node at an unknown place support, or None.
+    """Return the learned airframe that levels of a node at an unknown position support, or None.
 
-    The levels, in any unit, must be more likely with its gain than with an unknown gain and than with each rotated
-    copy. Each likelihood is a mean over the likely places of the node.
+    The levels, in any unit, must be more likely with the gain of the airframe than with an unknown gain and with each
+    rotated copy. Each likelihood is a mean over the likely positions of the node.
 
     Parameters
     ----------
@@ -885,7 +889,7 @@ def searching_airframe(
     Returns
     -------
     SpherePattern or None
-        Its gain over the directions of the airframe.
+        Gain of the airframe over its directions.
     """
     if len(track.level_db) < FEWEST or track.rotation is None:
         return None
@@ -913,7 +917,7 @@ def searching_airframe(
 
 
 def _likely_places(track: LevelTrack) -> FloatArray:
-    """Return the places (n, 3) of a node that its levels fit best with unknown antennas [m]."""
+    """Return the positions (n, 3) of a node that its levels fit best if the antennas are unknown [m]."""
     flat = track.position_m[:, :2]
     low, high = flat.min(axis=0) - _BEYOND_M, flat.max(axis=0) + _BEYOND_M
     step = (high - low) / (_PER_SIDE - 1)
@@ -957,7 +961,7 @@ def learned_towers(site: str | Path, log: tuple[str, str], *, loses_lock: bool) 
 def offered(data: FlightData) -> FlightFile | None:
     """Return the settings of a flight with the learned antennas that its levels support. None if no antenna fits."""
     site = data.settings.site.file
-    own = frozenset(data.settings.towers)  # like rovers of other flights, the flight file itself places these nodes
+    own = frozenset(data.settings.towers)  # the flight file states the positions of these nodes
     nodes = Nodes(placed=own, fixed=[name for name in data.site.towers if name not in own])
     try:
         known = propose(data, data.site_place, str(Path(site).with_suffix("")), nodes, carrier_known=True)
@@ -972,7 +976,7 @@ def offered(data: FlightData) -> FlightFile | None:
 def errors_elsewhere(
     antennas: Mapping[str, learned.Named], series: RssSeries, flown: tuple[FloatArray, FloatArray] | None = None
 ) -> tuple[learned.Errors | None, str]:
-    """Return the errors of learned antennas on held-out flights like that of a series, and a phrase for their kind.
+    """Return the errors of learned antennas on held-out flights like this flight, and a phrase for the kind of flights.
 
     Without such antennas the errors are None.
 
@@ -983,7 +987,7 @@ def errors_elsewhere(
     series : RssSeries
     flown : (n, 3) and (n,), optional
         Positions [m], and standard deviation of the learned gain there [dB]. They show whether the height or the
-        directions are new, which have larger errors.
+        directions are new: errors are then larger.
 
     Returns
     -------
@@ -1000,7 +1004,7 @@ def errors_elsewhere(
 # Kind of the expected error with the antenna of the UAV alone.
 ALONE = "with the airframe alone"
 
-# Directions are new if the standard deviation of the gain exceeds this multiple of that in learned directions.
+# Directions are new if the standard deviation of the gain exceeds that in learned directions by this factor.
 _UNSEEN_SD = 2.0
 
 
@@ -1026,7 +1030,7 @@ def _expected(
 
 
 def lock_elsewhere(data: FlightData, series: RssSeries) -> learned.LearnedLock | None:
-    """Return P(lock) of the receiver that the flight file names for a series, or else of that of its learned airframe.
+    """Return P(lock) of the receiver that the flight file names for a series, or else of the airframe's receiver.
 
     None if the receiver never loses its lock, is not known, or was learned from this series.
     """

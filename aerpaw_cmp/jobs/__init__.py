@@ -1,1 +1,1 @@
-"""Each job as named stages: report, campaign, map, bench."""
+"""The jobs of the commands, each divided into named stages."""

@@ -1,7 +1,7 @@
 """Audit of a flight's replays: paths by the other engine, fields by Sionna and by a second implementation.
 
-The inputs of the second implementation come from the settings, not from the arrays and losses of the replay, so that
-an error in between is detected.
+The inputs of the second implementation come from the settings, not from the arrays and losses of the replay. An error
+in the code between the settings and the replay is therefore detected.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ATTITUDE_ROWS = 200
 # Largest difference of both rotations: they are float64, and telemetry times are exact to a nanosecond.
 _ATTITUDE_TOLERANCE_RAD = 1e-6
 
-# Links of all series together, at least three per series. Each takes about 0.1 s.
+# Largest number of links of all series together, but at least three per series. A link takes about 0.1 s.
 _REFERENCE_LINKS_AT_MOST = 64
 
 _TIMES = "Time: the part of the replay for the audited links. Time of the reference: with its start."
@@ -65,10 +65,10 @@ def audit_replays(
     ----------
     data : FlightData
     replays : sequence of Replayed
-        Replays of its RSS series, then of its ranks.
+        Replays of the RSS series of the flight, then of its rank series.
     progress : Progress
     anew : bool
-        Ignore the cached audit.
+        True to ignore the cached audit.
 
     Returns
     -------
@@ -167,7 +167,7 @@ _MOMENTS = 6
 
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected, RtSettings]]:
-    """Yield replays, expected inputs and settings. A moving tower is replaced by fixed towers at some times."""
+    """Yield replays, expected inputs and settings. A moving tower is replaced by fixed towers at several times."""
     of_each = _settings_of(data)[: len(replays)]
     for replayed, expected, rt in zip(replays, expectations(data, replays), of_each, strict=True):
         site = data.site.under(rt.foliage)
@@ -199,7 +199,7 @@ def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected
         reference.ExpectedLoss(**{key: value for each in LOSSES for key, value in each.expected(rt).items()})
         for rt in _settings_of(data)
     ]
-    if len(settings) != len(replays):  # only a part of the flight was replayed: use the links of the replays
+    if len(settings) != len(replays):  # only some series were replayed: use the links of the replays
         return [Expected.of(r.link, losses[0]) for r in replays]
     return [
         Expected(expected_link(link, list(r.link.tower_arrays), data.folder), loss)

@@ -114,7 +114,7 @@ def speed_against_error(
         The image engine is first, because Sionna increases the memory of the process permanently. A row has
 
         - ``engine``, ``samples`` (rays per tower and batch), ``arrays`` (type of H), ``depth``
-        - ``seconds`` (wall time, warm), ``search_seconds`` (those of the path search), ``links_per_s`` (pose-tower
+        - ``seconds`` (wall time, warm), ``search_seconds`` (of the path search), ``links_per_s`` (pose-tower
           pairs), ``peak_mib`` (process; 0: unknown)
         - ``missing_paths``, ``extra_paths``, ``coverage_differs`` (links with a level in one replay only)
         - ``rss_max_error_db``, ``rss_rms_error_db`` over links with a level in both replays (None if there are none)
@@ -135,13 +135,14 @@ def speed_against_error(
 def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: Search) -> Row:
     """Replay all poses with an engine and return its row."""
     sionna = search.engine == "sionna"
-    # without the cache, because a cached search would only measure the time of reading
+    # replay without the cache: otherwise only the time of reading the cache would be measured
     alone = Run(cache_dir="")
     if sionna:
         replay(site, link, poses[:BATCH], search, run=alone)  # compiles the kernels
     begin_peak()
     started = time.perf_counter()
-    # the image engine's search takes a few hundredths of a second, so that one run would mainly show the machine's load
+    # the search of the image engine takes a few hundredths of a second, so a single run would mainly show the load of
+    # the machine
     runs = [replay(site, link, poses, search, run=alone) for _ in range(1 if sionna else _REPEATS)]
     seconds, result = (time.perf_counter() - started) / len(runs), runs[-1]
     difference = compare(result, reference, np.arange(len(poses)), RANK_K)
@@ -186,7 +187,7 @@ def path_search_ratios(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 def median_seconds(action: Callable[[], Any], repeats: int) -> float:
-    """Return the median processor time after a warm-up. Other running programs do not change it."""
+    """Return the median processor time after a warm-up. Other running programs hardly affect it."""
     return statistics.median(timeit.repeat(action, timer=time.process_time, number=1, repeat=repeats + 1)[1:])
 
 
@@ -215,7 +216,7 @@ def kriging_vs_pykrige(positions: int = 2556) -> Row | None:
 def ingest_vs_pandas(lines: int = 20_523) -> Row:
     """Compare the reader of power logs with ``pandas.read_csv(engine="c")``, on a log as long as a real flight.
 
-    The reader returns UTC times, levels, flags and the account of every line; pandas returns text and numbers.
+    The reader returns UTC times, levels, flags and the account of every line. pandas returns only text and numbers.
     """
     import pandas as pd
 

@@ -40,7 +40,7 @@ from ..site.learned import AIRFRAME_BAND, DirectionCovariance, LearnedHealth, Le
 
 
 def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
-    """Return a model of P(lock) by antenna, learned from levels predicted from other flights, with held-out scores.
+    """Return a model of P(lock) and its held-out scores for each antenna. Levels are predicted from other flights.
 
     Parameters
     ----------
@@ -104,8 +104,8 @@ def learned_healths(observed: Sequence[Observed], fits: Mapping[str, Learned]) -
 def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
     """Return gains learned without each pair of flights, by pair.
 
-    P(lock) of one flight is predicted by a fit to the other flights. The levels of each of these are predicted without
-    both flights.
+    P(lock) of one flight is predicted by a fit to all other flights. The levels of each of these other flights are
+    predicted from the flights other than the two.
     """
     out: dict[tuple[str, str], Learned] = {}
     for one, other in combinations(groups_of(flights_of(observed)), 2):
@@ -170,7 +170,7 @@ _CENTRAL = 3.29
 
 
 def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
-    """Fit lines to the level over path gain, with and without lock, and return levels, slope and spread."""
+    """Fit lines to the level over path gain, with and without lock. Return levels, slope and standard deviations."""
     numbers: dict[str, float] = {}
     for name, in_lock in (("locked", True), ("lost", False)):
         parts = [f.detected == in_lock for f in flights]
@@ -202,7 +202,7 @@ class PatternsSettings(StrictModel):
     Parameters
     ----------
     towers : mapping of str to AntennaSettings
-        Patterns by ``tower.channel``, for towers with a different pattern.
+        Patterns by ``tower.channel``, for antennas with a different pattern.
     """
 
     uav: AntennaSettings | None = None
@@ -214,7 +214,7 @@ _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
 
 
 class CampaignSettings(StrictModel):
-    """The flights of a campaign, with one error model. Campaigns with the same airframe share the gain of the UAV."""
+    """The flights of a campaign, with a common error model. Campaigns with the same airframe share the UAV's gain."""
 
     flights: Annotated[list[str], Field(min_length=1)]
     source: Source = Source()
@@ -228,7 +228,8 @@ class CalibrationFile(StrictModel):
     flights : list of str
         All flights, including those of ``campaigns``.
     campaigns : mapping of str to CampaignSettings
-        Campaigns by name, if antennas are learned from several campaigns together. Each becomes an entry of the site.
+        Campaigns by name, if antennas are learned from several campaigns together. Each campaign becomes an entry of
+        the site.
     source : Source
         Title, DOI and licence of the data, and the airframe. They are stored with the learned models of a site.
     rank : bool
@@ -252,7 +253,7 @@ class CalibrationFile(StrictModel):
         return {**data, "flights": [name for some in each if isinstance(some, list) for name in some]}
 
     def by_campaign(self) -> dict[str, CampaignSettings]:
-        """Return the campaigns. Without campaigns, return one with the name of the calibration."""
+        """Return the campaigns. If there are none, return a single campaign with the name of the calibration."""
         return self.campaigns or {self.calibration: CampaignSettings(flights=self.flights, source=self.source)}
 
 
@@ -269,7 +270,8 @@ class Calibration:
     health : mapping of str to LearnedHealth
         Usual errors of held-out flights, by antenna.
     teaching : set of str
-        Campaigns whose UAV gain predicts most of their held-out flights. Only such a gain may be used elsewhere.
+        Campaigns whose UAV gain is supported by most of their held-out flights. Only the gain of these campaigns may be
+        used elsewhere.
     """
 
     settings: CalibrationFile
@@ -347,8 +349,8 @@ def calibrate(
     flights : sequence of FlightData
         Flights, as returned by :func:`read_flights`.
     folder, logs_root : Path
-        Folder for relative paths of patterns, and folder of the logs of ``score`` (by default, that of their flight
-        file).
+        Folder for relative paths of patterns, and folder of the logs of ``score`` (by default, the folder of each
+        flight file).
     campaigns : mapping of str to str, optional
         Campaign of each flight, from :func:`read_flights`. By default, all flights are one campaign.
     stages : Stages, optional
@@ -413,7 +415,7 @@ def calibrate(
 def _score_further(
     further: Sequence[FlightData], flights: Sequence[FlightData], learned: Learned, observed: Sequence[Observed]
 ) -> tuple[tuple[Score, ...], list[str]]:
-    """Score additional flights with the learned antennas, and return remarks about those that were training flights."""
+    """Score additional flights with the learned antennas, and return remarks about training flights."""
     distinct, remarks = counted_once([*flights, *further])
     fresh = [data for data in distinct if not any(data is item for item in flights)]
     if not fresh:
@@ -451,7 +453,7 @@ def in_campaigns(
 ) -> list[Observed]:
     """Return samples with their campaign, airframe and band filled in, if there are several campaigns.
 
-    Airframes of the same name share their gain within a band, which extends 7 % above its lowest carrier.
+    Airframes of the same name share their gain within a band. A band extends 7 % above its lowest carrier.
 
     Parameters
     ----------
@@ -591,7 +593,7 @@ def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
 def _score_all(
     observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
 ) -> dict[str, tuple[Score, ...]]:
-    """Score every split (flight, height, heading, sector) on samples that were not fitted. Splits share fits.
+    """Score every split (flight, height, heading, sector) on samples that were not fitted. Splits share their fits.
 
     Parameters
     ----------
@@ -644,13 +646,13 @@ def _controls_of(
     }
 
 
-# Share of the variance that the stored directions of a gain may miss, and their largest number.
+# Share of the variance of a gain that the stored directions may miss, and the largest number of these directions.
 _KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
 _LENGTHS: Mapping[gains.Frame, float] = {term.frame: term.length for term in gains.ANTENNA_TERMS}
 
 
 def direction_covariance(fit: gains.GainFit, antenna: str, frame: gains.Frame = "body") -> DirectionCovariance:
-    """Return the directions at one end that determine its gain, and the covariance there.
+    """Return the directions at one end that determine its gain, and the covariance of the gain in these directions.
 
     With 60, 100 or 200 directions, the evidence for an airframe differs by at most 3 nat.
     """
@@ -677,7 +679,7 @@ def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: M
 def _contradictions(
     scores: Sequence[Score], controls: Mapping[str, Sequence[Score]], campaigns: Mapping[str, str]
 ) -> list[str]:
-    """Return a sentence per campaign for which the airframe of the others is worse than free space or a control."""
+    """Return a sentence per campaign for which other campaigns' airframe is worse than free space or a control."""
     out = []
     for name in dict.fromkeys(campaigns[s.flight] for s in scores):
 

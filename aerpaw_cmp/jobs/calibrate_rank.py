@@ -1,4 +1,4 @@
-"""The part of ``calibrate`` that learns how a modem decides its rank, and scores this on held-out flights.
+"""The part of ``calibrate`` that learns how a modem decides its rank, and scores the result on held-out flights.
 
 The channel model contains only the direct path and one ray reflected by flat ground at height 0. At a rural site, the
 orientation of the antenna ports and the strength of the ground ray affect the rank more than walls do.
@@ -50,7 +50,7 @@ class RankGrid:
     Parameters
     ----------
     yaw_step_deg : float
-        Step between mounts of the modem's array.
+        Step between the tried mounts of the modem's array.
     uav_slant_deg : tuple of tuple of float
         Slants of the modem's ports.
     ground : tuple of float
@@ -81,7 +81,7 @@ class RankSamples:
     logs : tuple of str
         SHA-256 of the logs with the reports.
     mark : str
-        Fingerprint of these reports, independent of their log.
+        Fingerprint of these reports, which does not depend on the file of the log.
     """
 
     flight: str
@@ -137,7 +137,7 @@ class FittedReceiver:
     def forecast(self, samples: RankSamples, turns_deg: Sequence[float] = (0.0,)) -> tuple[FloatArray, IntArray]:
         """Return the probability of each rank (n, 4), averaged over headings of the UAV, and the decided rank (n,)."""
         turned = [
-            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # many of the rotated mounts are equal
+            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # rotated mounts may be equal to others
             for turn in turns_deg
             for g in self.geometries
         ]
@@ -252,7 +252,7 @@ def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArr
     """Return the squared singular values of the modelled channels, shape (geometries, n, 4)."""
     order = sorted(
         range(len(geometries)), key=lambda i: geometries[i].mount_deg
-    )  # sorted, so that neighbouring geometries share a mount
+    )  # sorted, so that geometries with the same mount are neighbours
     singular = singular_values_of(
         [geometries[i] for i in order], samples.link.tower_arrays[samples.tower], samples.tower_m,
         samples.link.uav_array, samples.poses, samples.link.carrier_hz,
@@ -273,7 +273,7 @@ def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatA
 
 
 def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
-    """Return the geometries to try: upright, rolled by 90 deg, and lying flat. Half a turn repeats the first two."""
+    """Return the geometries to try: upright, rolled by 90 deg, and lying flat. The first two repeat after 180 deg."""
     half, full = (np.arange(0.0, end, grid.yaw_step_deg) for end in (180.0, 360.0))
     mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
     tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
@@ -321,7 +321,7 @@ def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
 
 
 def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
-    """Score forecasts of held-out sectors, fitted to the other sectors with the geometries of other flights."""
+    """Score forecasts of held-out sectors. They are fitted to other sectors, with the geometries of other flights."""
     good = samples.part(samples.rank >= 1)
     groups = receiver.sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty
@@ -351,8 +351,8 @@ class Tried:
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
         """Choose geometries and timing on some flights, and fit the receiver.
 
-        First, geometries are chosen without timing. With the best of them, the timing is chosen. With this timing, all
-        geometries are compared a second time.
+        First, geometries are chosen without timing. Then the timing is chosen with the best of these geometries. With
+        this timing, all geometries are compared a second time.
         """
         first = self.choose(flights, Timing())
         timing = self.choose_timing(flights, first.order[: self.grid.members])
@@ -398,6 +398,6 @@ class Tried:
 
 
 def _groups(samples: Sequence[RankSamples]) -> IntArray:
-    """Return the sector of each sample. A sector is held out of all flights together."""
+    """Return the sector of each sample. A sector is held out in all flights at the same time."""
     position_m = np.concatenate([sample.poses.position_m for sample in samples])
     return receiver.sector_groups(position_m, samples[0].tower_m)

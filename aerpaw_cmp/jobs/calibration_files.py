@@ -33,7 +33,8 @@ from .calibrate_rank import RankCalibration
 # Start of calibrated.yaml, which identifies an earlier output of this tool.
 _MARK = "# aerpaw-cmp calibrate"
 
-# Share of the variance of the joint gain that the stored directions may miss, and their largest number.
+# Share of the variance of the joint gain that the stored directions may miss, and the largest number of these
+# directions.
 _PAIR_SHARE, _MOST_PAIRS = 0.01, 400
 
 
@@ -116,7 +117,7 @@ def _pair_gain(calibration: Calibration, antenna: str) -> learned.PairGain | Non
 def _learned_antenna(
     calibration: Calibration, antenna: str, end: str, files: Mapping[str, str], place: str, command: str
 ) -> dict[str, Any]:
-    """Return the array of one end for calibrated.yaml: its table, with SHA-256 and error model."""
+    """Return the array of one end for calibrated.yaml: the table of the gain, with SHA-256 and error model."""
 
     def sha256(file: str) -> str:
         return hashlib.sha256(files[file].encode()).hexdigest()
@@ -175,7 +176,7 @@ def learned_settings(
             entry["tower"] = at_tower
         else:
             entry.setdefault("towers", {})[tower] = at_tower
-    # the gains were learned with the direct path only
+    # the gains were learned with the direct path only, so replay the direct path only
     return {"link": {"channels": channels}, "rt": {"engine": "image", "attitude": "logged", "max_depth": 0}}
 
 
@@ -292,7 +293,7 @@ def write_files(
 
 
 def site_entries(calibrated: Calibrated) -> dict[str, tuple[learned.Entry, dict[str, bytes]]]:
-    """Return the entries for the learned models of a site, by campaign. Each has its tables by name."""
+    """Return the entries for the learned models of a site, each with its tables by name, by campaign."""
     settings, out = calibrated.settings, {}
     maps = None if calibrated.calibration is None else _antenna_maps(calibrated.calibration)
     for name, campaign in settings.by_campaign().items():
@@ -329,12 +330,12 @@ def _learned_series(
     mine = [o.samples for o in calibration.observed if calibration.campaigns[o.samples.flight] == name]
     for antenna in (a for a in calibration.fit.antennas if any(s.antenna == a for s in mine)):
         samples = [s for s in mine if s.antenna == antenna]
-        # the UAV has the same antenna for all towers of a band
+        # the UAV has the same antenna for all towers of a band, so one table is enough
         shared = next(s.antenna for s in mine if s.airframe == samples[0].airframe)
         parts = {"tower": antenna, "pair": antenna, "tower_known": antenna, "uav": shared, "known": shared}
         files = {part: f"{safe_name(f'{name}.{owner}.{part}')}.csv.gz" for part, owner in parts.items()}
         notes = {p: (f"aerpaw-cmp calibrate: {name}, {antenna} {p}", *_provenance_notes(calibration)) for p in files}
-        # omit fingerprints: they would be most of the size of these tables, which flight files never name
+        # omit fingerprints, which would be most of the size of these tables. Flight files never name the tables.
         notes |= {part: notes[part][:2] for part in ("known", "tower_known", "pair")}
         for end in ("tower", "uav"):
             gains = maps[parts[end], end]
@@ -389,7 +390,7 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> le
         if (s.tower, s.channel) == (series.tower, series.channel)
     ]
     n = max(len(squares), 1)
-    # the difference from the mean of the n - 1 other flights is n / (n - 1) times that from the mean of all n
+    # the difference from the mean of all n flights is (n - 1) / n times that from the mean of the other n - 1 flights
     between_db = offset_sd_db((1.0 - 1.0 / n) ** 2 * sum(squares), n - 1)
     return learned.LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
@@ -446,5 +447,5 @@ def _errors(calibration: Calibration, name: str) -> learned.Errors | None:
     return learned.Errors(series=len(scores), heights_m=sorted(heights), **values)
 
 
-# Split by the prefix of its error. For "airframe", only the airframe of other campaigns is used.
+# Name of the split for the prefix of each error. For "airframe", only the airframe of other campaigns is used.
 _PARTS = {"sector": "sector", "height": "altitude", "heading": "heading", "airframe": "campaign"}

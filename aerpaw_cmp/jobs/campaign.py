@@ -1,10 +1,12 @@
 """The ``campaign`` job: compare many flights under many settings.
 
 A campaign.yaml names flight files and, optionally, settings: labels with overrides of flight keys in dotted form
-(``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
+(``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read becomes a row with the error
+message.
 
-A task is one flight under one setting. Workers run tasks and return rows of numbers, which are stored. The rows of
-several flights determine held-out errors, a ranking of settings, steps of offsets, and mean residuals by position.
+A task is one flight under one setting. Workers run tasks and return rows of numbers, which are stored. From the rows of
+several flights, the job computes held-out errors, a ranking of settings, steps of offsets, and mean residuals by
+position.
 """
 
 from __future__ import annotations
@@ -57,9 +59,10 @@ class Task:
     Parameters
     ----------
     reference : bool
-        True for the setting whose flights are compared with each other: its positions are stored.
+        True for the setting whose flights are compared with each other. The positions of these flights are stored.
     key : str, optional
-        Digest of the inputs as the planning process sees them. None if an input cannot be read or there is no store.
+        Digest of the inputs as read by the process that plans the tasks. None if an input cannot be read or there is no
+        store.
     """
 
     path: Path
@@ -118,13 +121,13 @@ def _settings(task: Task) -> FlightFile:
 
 @lru_cache(maxsize=2)
 def _logs(key: _Logs) -> Any:
-    """Return the logs of a flight, which are read once for all settings."""
+    """Return the logs of a flight. They are read once for all settings."""
     return read_logs(key.settings, key.folder, key.logs_root)
 
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """A cache key of logs. It compares only the settings on which the reading of logs depends."""
+    """A cache key of logs. It compares only settings that affect how logs are read."""
 
     folder: Path
     logs_root: Path | None
@@ -134,7 +137,7 @@ class _Logs:
 
 
 def flight_data(task: Task) -> FlightData:
-    """Read the flight of a task. The errors are those of :mod:`aerpaw_cmp.flight.data`."""
+    """Read the flight of a task, with the errors of :mod:`aerpaw_cmp.flight.data`."""
     settings = _settings(task)
     folder, root = task.path.parent, task.logs_root
     text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
@@ -160,7 +163,7 @@ def run_task(task: Task) -> Outcome:
 
 
 def failed_task(task: Task, message: str, error: BaseException | None = None) -> Outcome:
-    """Return the outcome of a failed task: its message, and the traceback for a separate file."""
+    """Return the outcome of a failed task: the message, and the traceback for a separate file."""
     text = "" if error is None else "".join(traceback.format_exception(error))
     return Outcome(failure=page.Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
 
@@ -203,9 +206,10 @@ def digest_of(task: Task) -> str:
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
-    """Return a stored outcome with the flight and setting names of ``task``. Only the first setting keeps its samples.
+    """Return a stored outcome with the names of ``task``, and without samples except for the first setting.
 
-    Rows of all other settings contain only numbers, because the samples of thousands of tasks would not fit in memory.
+    For all other settings, the rows contain only numbers, because the samples of thousands of tasks would not fit in
+    memory.
     """
     names = {"flight": task.flight, "setting": task.setting}
 
@@ -229,7 +233,7 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 
 
 def _rss_row(task: Task, data: FlightData, result: RssResult, series: RssSeries) -> page.RssRow:
-    """Return the row of a channel. Its log is identified by content, regardless of name and packing."""
+    """Return the row of a channel. The log is identified by content, regardless of file name and packing."""
     score, clock = result.score, result.further.clock
     # exclude a flight from pooling and ranking if its antennas were learned from its own log
     measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
@@ -338,7 +342,7 @@ def compute(
     Parameters
     ----------
     tasks : mapping of int to Task
-        By task number.
+        Tasks by task number.
     workers : Workers
     outcomes : dict of int to Outcome
         Receives the new outcomes.
@@ -375,7 +379,7 @@ class CampaignFile(StrictModel):
     title: str | None = None
     flights: list[str] = Field(default_factory=list)
     soundings: list[str] = Field(default_factory=list)
-    timezone: str | None = None  # time zone of soundings with local times
+    timezone: str | None = None  # time zone of soundings whose times are local
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
 
@@ -385,7 +389,8 @@ def load_campaign(path: Path) -> CampaignFile:
     Raises
     ------
     UsageError
-        If the file is wrong, as for :func:`aerpaw_cmp.common.yamlfile.load_yaml`, or names nothing to run.
+        If the file is wrong, as for :func:`aerpaw_cmp.common.yamlfile.load_yaml`, or names neither flights nor
+        soundings.
     """
     campaign = load_yaml(path, CampaignFile)
     if not campaign.flights + campaign.soundings:
@@ -417,18 +422,18 @@ def run(
         Folder for the paths of flight files.
     options : RunOptions
     keep : Path, optional
-        Folder of stored outcomes, which is read and extended.
+        Folder of stored outcomes. Outcomes are read from it and added to it.
     stages : Stages, optional
 
     Returns
     -------
     CampaignData
-        Rows of every flight and setting, and repeats. ``failures`` has the flights that failed.
+        Rows of every flight and setting, and repeats. ``failures`` contains the flights that failed.
 
     Raises
     ------
     UsageError
-        If overrides are invalid, or two flights have one name.
+        If overrides are invalid, or two flights have the same name.
     """
     stages, progress, logs_root = stages or Stages(), options.progress, options.logs_root
     if options.scheduler is not None:  # workers may run in another folder
@@ -479,7 +484,7 @@ def campaign_tasks(
     Raises
     ------
     UsageError
-        If overrides are invalid, or two flights have one name.
+        If overrides are invalid, or two flights have the same name.
     """
     settings = campaign.settings or {_AS_WRITTEN: {}}
     files, failures = _flight_files(campaign, folder, settings)
@@ -530,7 +535,7 @@ def _flight_files(
 
 
 def repeats(rows: Sequence[page.RssRow]) -> list[PassPair]:
-    """Compare every pair of flights with a common tower and channel. ``rows`` are those of one setting."""
+    """Compare every pair of flights with a common tower and channel. ``rows`` are the rows of one setting."""
     passes = [
         Pass(
             flight=row.flight,
@@ -582,13 +587,13 @@ def transfer_ranks(rows: Sequence[page.RankRow]) -> list[page.RankTransfer]:
 def with_season(
     data: page.CampaignData, reports: Mapping[str, str] | None = None, sounded: Sequence[NodeOffset] = ()
 ) -> page.CampaignData:
-    """Return the campaign with held-out errors in its rows, and its numbers over several flights.
+    """Return the campaign with held-out errors in its rows, and with the numbers that need several flights.
 
     Parameters
     ----------
     data : CampaignData
     reports : mapping of str to str, optional
-        Address of the report of each flight, relative to the campaign's folder.
+        Address of the report of each flight, relative to the folder of the campaign.
     sounded : sequence of NodeOffset
         Node offsets from tower-to-tower soundings (:func:`soundings`). They replace the offsets of the flights.
     """
@@ -650,13 +655,13 @@ def _held_out_rows(rows: Sequence[page.RssRow]) -> list[page.RssRow]:
 def rank_settings(
     rows: Iterable[page.RssRow], settings: Sequence[str], flights: Sequence[str]
 ) -> list[page.SettingRank]:
-    """Rank settings by their mean error over flights, with their difference from the first on the same flights.
+    """Rank settings by their mean error over flights. Add the difference from the first setting on the same flights.
 
     Parameters
     ----------
     rows : iterable of RssRow
     settings : sequence of str
-        Labels. Ties keep their order.
+        Labels of the settings. Settings with equal errors keep this order.
     flights : sequence of str
         Flights that are compared.
 
@@ -718,7 +723,7 @@ def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, 
     Parameters
     ----------
     paths : sequence of Path
-        Logs, their folders, or a flight file of ``ingest -o``. Only streams with transmitter and receiver are used.
+        Logs, folders of logs, or a flight file of ``ingest -o``. Only streams with transmitter and receiver are used.
     timezone : str, optional
         Time zone of logs with local times.
 
@@ -754,7 +759,8 @@ def _radio(link: Mapping[str, Any], end: str) -> str:
     return str(link[end]) + (f" {serial}" if serial else "") + (f":{channel}" if channel else "")
 
 
-# --- places -----------------------------------------------------------------------------------------------------------
+# --- positions
+# -----------------------------------------------------------------------------------------------------------
 
 
 def _places_db(rows: Sequence[page.RssRow], cell_m: float) -> dict[tuple[int, int], float]:
@@ -774,7 +780,7 @@ def _places_db(rows: Sequence[page.RssRow], cell_m: float) -> dict[tuple[int, in
 def find_reports(flights: Iterable[str], folder: Path) -> dict[str, str]:
     """Return the address of the report of each flight, relative to the folder of the campaign's page, if it exists.
 
-    Reports are in folders with the names of their flights next to that folder.
+    Reports are next to that folder, in folders with the names of their flights.
     """
     return {
         name: quote(f"../{name}/report.html") for name in flights if (folder.parent / name / "report.html").is_file()

@@ -34,8 +34,8 @@ from .tasks import inputs_of_flight
 
 _MOST_POSES = 10_000_000
 
-# Size of gains and frequency responses per part, and largest size in memory [bytes]. The other two numbers are
-# estimates: paths per link, and bytes per path in addition to its gains.
+# Size of gains and frequency responses per part, and largest size in memory [bytes]. Estimates: number of paths per
+# link, and bytes per path in addition to its gains.
 _PART_BYTES, MOST_BYTES, _PATHS, _PATH_BYTES = 16 << 20, 2 << 30, 4, 512
 
 
@@ -48,11 +48,11 @@ class ChannelOptions:
     route : Path, optional
         Route that replaces the flight's track or plan.
     link : str, optional
-        ``rss``, ``rank`` or a channel of the flight file. Default: its first channel, else ``rss``.
+        ``rss``, ``rank`` or a channel of the flight file. Default: the first channel of the flight file, else ``rss``.
     towers : sequence of str
         Default: the towers of the logs, else all towers of the site.
     step_s : float
-        Time between poses.
+        Time between poses [s].
     formats : sequence of str
         Names in :data:`aerpaw_cmp.report.channel.FORMATS`.
     bandwidth_hz : float, optional
@@ -142,7 +142,7 @@ def _offsets_hz(chosen: ChannelOptions, carrier_hz: float) -> FloatArray | None:
 
 
 def _moving(data: FlightData, chosen: ChannelOptions, towers: Sequence[str], remarks: list[str]) -> Along:
-    """Return the poses of the track or route, with the velocities of both ends if they are known."""
+    """Return the poses of the track or route, and the velocities of both ends if they are known."""
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
     # a speed over less than one second is mostly noise of the positions
     spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # a long step is not a gap
@@ -157,7 +157,7 @@ def _moving(data: FlightData, chosen: ChannelOptions, towers: Sequence[str], rem
 def _poses_at_once(
     count: int, link: Link, offsets_hz: FloatArray | None, engine: str, room: int | None
 ) -> tuple[int, str]:
-    """Return the number of poses of a part, and advice for a channel that is too large, which is refused.
+    """Return the number of poses of a part, and the advice for a channel that is refused because it is too large.
 
     ``count`` is the number of all poses, and ``room`` [bytes] the largest size of all parts (None: a single part).
     """
@@ -216,7 +216,7 @@ def _steps_s(length_s: float, step_s: float) -> FloatArray:
         raise UsageError(
             f"{length_s / step_s:.3g} poses", expected=f"at most {_MOST_POSES}", cause="a --step that is not in seconds"
         )
-    # include the end, although the sum of steps may round to more
+    # include the end, even if rounding makes the last step slightly larger
     return np.arange(0.0, length_s + 1e-9, step_s)
 
 
@@ -243,7 +243,7 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> A
 
 
 def _planned(data: FlightData, route: Path, step_s: float) -> Along:
-    """Return poses of a level aircraft along a route or plan, with the heading of the route, else along the course."""
+    """Return poses of level flight along a route or plan. The heading is that of the route, or else the course."""
     targets = find_targets(route, data.site, TargetOptions())
     if targets.kind == "grid":
         found = "a site, not a route" if route.exists() else "no such file"
@@ -251,7 +251,7 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
     time, yaw, remarks = targets.time_s, targets.yaw_deg, targets.remarks
     position = np.where(targets.known[:, None], targets.position_m, np.nan)
     if len(time) > 1 and (np.diff(time) > 0.0).all():
-        time = time - time[0]  # the times of a table may count from any instant
+        time = time - time[0]  # the times of a table may have any origin
         wanted = _steps_s(time[-1], step_s)
         yaw = yaw[np.searchsorted(time, wanted, side="right") - 1]
         time, position = wanted, interpolated(wanted, time, position)
@@ -271,13 +271,13 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
 
 
 def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> Callable[[Poses], dict[str, Any]]:
-    """Return a function for the calibrated levels of poses, with the learned antennas of the site if there are any."""
+    """Return a function for the calibrated levels at poses, with the learned antennas of the site if there are any."""
     towers, sources = tuple(link.tower_arrays), dict[str, Source]()
     memory = memory_of(data.site_place, data.site)
     if memory is None:
         remarks.append("No calibrated level: no antennas were learned for this site (aerpaw-cmp calibrate).")
         return lambda _: {}
-    # try the antennas of the link's channel first (False sorts before True), then those of another channel
+    # try the antennas of the link's channel first (False sorts before True), then antennas of other channels
     for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
         near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
         if source.tower in towers and near and source.tower not in data.nodes:
@@ -292,7 +292,7 @@ def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> C
     units = ", ".join(dict.fromkeys(source.unit for source in sources.values()))
 
     def levels(poses: Poses) -> dict[str, Any]:
-        """Return level and standard deviation (poses, towers)."""
+        """Return level and standard deviation, each (poses, towers)."""
         level, sd = np.full((2, len(poses), len(towers)), np.nan)
         heading, up = bearing_deg(poses.rotation[:, :, 0]), poses.rotation[:, :, 2]
         for tower, source in sources.items():
@@ -323,19 +323,19 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root, route = options.logs_root or flight.parent, chosen.route
     if route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):
-        route = flight  # the flight has no logs yet, so use its plan
+        route = flight  # without logs, the route is the plan of the flight
     inputs = [*inputs_of_flight(settings, flight, root), *([] if route is None else target_files(route, None, root))]
     folder = options.out or Path("reports") / f"channel-{settings.flight.name}"
     with OutputFolder(folder, job="channel", inputs=inputs, force=options.force) as output:
         with stages("read"):
             data = (load_data if route is None else unread)(settings, flight.parent, options.logs_root)
         with output.filling() as place:
-            # formats written part by part are limited by the disk, the others by memory
+            # formats that are written part by part are limited by the disk, all others by memory
             room = shutil.disk_usage(place).free if STREAMED.issuperset(formats) else None
             parts = channel_parts(data, replace(chosen, route=route), stages, room)
             written, metrics = write_channel(parts, place, formats, stages)
         files = output.placed(written)
-        # warnings about the track do not concern a route
+        # a route does not use the track, so omit warnings about the track
         read = data.warnings if route is None else [f"{text}." for text in data.site.cautions()]
         warnings = [*read, *metrics.pop("warnings")]
         metrics |= {"files": [*map(str, files)], "warnings": warnings, "stages": stages.seconds}

@@ -1,7 +1,7 @@
-"""Comparison of each replayed series with its measurement, as the records of :mod:`aerpaw_cmp.compare.result`.
+"""Comparison of each replayed series with its measurement, in records of :mod:`aerpaw_cmp.compare.result`.
 
-To add a number of a tower and channel, add a field to ``RssFurther`` there and a function here, called in
-:func:`compare_rss_series`.
+To add a number per tower and channel, add a field to ``RssFurther`` in that module, and here a function that
+:func:`compare_rss_series` calls.
 """
 
 from __future__ import annotations
@@ -54,16 +54,17 @@ if TYPE_CHECKING:
     from .calibrate_rank import FittedReceiver
 
 
-# Both sides are averaged over these windows to see how much of the error is fading.
+# Measured and simulated power are averaged over these windows to see how much of the error is fading [s].
 _AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 
 # Largest distance between a pass of the first half and a pass of the second half of a flight at one position [m].
 _PASSES_WITHIN_M = 3.0
 
-# Number of random grounds for the error bar of rank agreement, and of poses replayed over each.
+# Number of random grounds for the error bar of the rank agreement, and number of poses that are replayed over each
+# ground.
 _DRAWS, _POSES = 6, 300
 
-# Shorter segments of large error are fades [s].
+# Segments of large error that are shorter than this are fades [s].
 _SHORTEST_S = 5.0
 
 
@@ -72,7 +73,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> records.FlightRes
     results = []
     for series, replayed in zip(data.rss, replays.rss, strict=True):
         results.append(compare_rss_series(data, series, replayed))
-        give_memory_back()  # a series of ten hours leaves 100 MiB in fragments, and the ranks need them
+        give_memory_back()  # a series of ten hours leaves 100 MiB of free fragments
     results = with_corrected_verdicts(results)
     cause, step = cause_of(data, replays, results)
     return records.FlightResult(
@@ -86,15 +87,16 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> records.FlightRes
     )
 
 
-# A predicted level of a cell counts within this time of a sample [s]: phones report once a second.
+# Largest time between a sample and the predicted level of a cell that is used for it [s]. Phones report once a second.
 _SERVING_WITHIN_S = 1.5
 
 
 def serving_of(series: Sequence[RssSeries], results: Sequence[records.RssResult]) -> ServingComparison | None:
     """Compare logged serving cells with the strongest predicted cells, or return None if no log has a serving cell.
 
-    The comparison has the cells that the flight file assigns to towers, at the times when one of them served. Levels
-    are as simulated: cells of one network have equal power, and an offset per cell would hide which one is stronger.
+    The comparison contains the cells that the flight file assigns to towers, at the times when one of these cells
+    served. Simulated levels are used without offsets: cells of one network have equal power, and an offset per cell
+    would hide which cell is stronger.
     """
     cells = [(cell, result) for cell, result in zip(series, results, strict=True) if cell.serving is not None]
     if len(cells) < 2 or not any(np.nansum(cell.serving) for cell, _ in cells if cell.serving is not None):
@@ -122,7 +124,8 @@ def serving_of(series: Sequence[RssSeries], results: Sequence[records.RssResult]
 class Levels:
     """Measured and simulated levels (n,) [dB].
 
-    ``posed`` is true for samples with a known pose above the lowest height. ``measured_db`` is NaN elsewhere.
+    ``posed`` is true for samples with a known pose above the lowest height. ``measured_db`` is NaN for all other
+    samples.
     """
 
     measured_db: FloatArray
@@ -143,10 +146,10 @@ def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> L
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Case:
-    """One tower and channel with the inputs of all its numbers.
+    """One tower and channel, with the inputs from which all its numbers are computed.
 
-    ``simple`` has the baselines at the samples. ``trained`` names logs of this flight from which its antennas were
-    learned. Such a series has no scores.
+    ``simple`` contains the baselines at the samples. ``trained`` lists logs of this series from which its antennas were
+    learned. A series with such logs is not scored.
     """
 
     data: FlightData
@@ -231,7 +234,8 @@ def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | Non
     simulated_db = case.levels.simulated_db
     above_db = simulated_db - series.link.transmit_power_dbm - lock.gain_db
     expected_db = lock.locked_db + lock.locked_per_db * above_db + score.offset_db - simulated_db
-    # a flight with stronger levels in lock than other flights at the same path gain also loses its lock later
+    # a flight whose levels in lock are stronger than those of other flights at the same path gain also loses its lock
+    # at a lower path gain
     own_db = (error_db - expected_db)[locked].mean()
     parts = LostLock(
         probability=_forecast(series, lock).probability(simulated_db + own_db),
@@ -279,14 +283,14 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
 
 
 def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> records.RssFurther:
-    """Return counts and conditions, and for a scored series further statistics of the error.
+    """Return counts and conditions, and for a scored series also further statistics of the error.
 
     Parameters
     ----------
     case : _Case
     score : RssComparison
     stated : StatedSpread, optional
-        Error bars that learned antennas state.
+        Error bars from learned antennas.
 
     Returns
     -------
@@ -346,11 +350,11 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
 
 
 def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> dict[str, Any] | None:
-    """Return the expected error on another flight of this kind, unless this flight contradicts it."""
+    """Return the expected error on another flight of the same kind, unless this flight contradicts it."""
     gain = case.replayed.learned
     flown = None if gain is None else (case.replayed.poses.position_m, gain.sd_db)
     errors, kind = errors_elsewhere(case.data.settings.learned, case.series, flown)
-    # the errors of a receiver were measured with the antennas of its own flights
+    # the lock model of a receiver applies only with the antennas of its training flights
     lock = None if kind == ALONE else _lock(case)
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
         return None
@@ -425,7 +429,7 @@ def _averaged(case: _Case) -> dict[str, dict[str, offsets.OffsetFit]]:
 
 
 def _snr(series: RssSeries, levels: Levels) -> records.SnrScore | None:
-    """Compare the replayed level above the receiver's noise with the logged ratio, without an offset."""
+    """Compare the simulated ratio of level and receiver noise with the logged ratio, without an offset."""
     if series.noise_dbm is None:
         return None
     error_db = levels.measured_db - (levels.simulated_db - series.noise_dbm)
@@ -441,7 +445,7 @@ def _snr(series: RssSeries, levels: Levels) -> records.SnrScore | None:
 
 
 def _detection(case: _Case) -> DetectionScore | None:
-    """Score P(lock) or P(above the floor), and all samples with the floor. None if there is neither lock nor floor."""
+    """Score P(lock) or P(above the floor), and all samples with the floor. None without lock and floor."""
     series, levels, lock = case.series, case.levels, _lock(case)
     if series.locked is not None:
         known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
@@ -492,7 +496,7 @@ def pairs_of(results: Sequence[records.RssResult]) -> list[records.PairResult]:
 
 
 def _same_instants(first: Any, second: Any) -> tuple[IntArray, IntArray]:
-    """Return the samples of two series that were taken within half a sampling interval of each other."""
+    """Return the indices of samples of two series that were taken within half a sampling interval of each other."""
     if len(first) == len(second) and (first == second).all():
         return np.arange(len(first)), np.arange(len(second))
     if len(first) < 2 or not len(second):
@@ -522,7 +526,7 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
     site : Site
     tower : str
     replayed : Replayed
-        Poses, arrays, and the samples that have a pose.
+        Replay of the series: poses, arrays, and the samples that have a pose.
     rt : RtSettings
         The depth of foliage is included unless ``foliage`` is ``none``.
 
@@ -673,7 +677,7 @@ def _repeated_rank(
 def _agreement_by_ground(
     data: FlightData, replayed: Replayed, measured: FloatArray, poses: IntArray, ks: Sequence[float]
 ) -> dict[str, float]:
-    """Return the standard deviation of a tower's rank agreement by K, over random grounds within their known errors.
+    """Return the SD of a tower's rank agreement by K, over random grounds within the errors of the known heights.
 
     Parameters
     ----------
@@ -683,7 +687,7 @@ def _agreement_by_ground(
     measured : (n,)
         Reported rank, NaN if the modem reported no rank.
     poses : (n,)
-        The replayed pose of each report.
+        Index of the replayed pose of each report.
     ks : sequence of float
 
     Returns

@@ -1,7 +1,7 @@
 """The ``map`` job: coverage and rank maps in several foliage modes, their study, and the record of the page.
 
-Paths do not depend on arrays or foliage, so each chunk of positions is searched once. Single elements, arrays and
-all foliage modes are evaluated on these paths, and a foliage mode only evaluates the links with foliage.
+Paths do not depend on arrays or foliage, so each chunk of positions is searched once. Single elements, arrays and all
+foliage modes are evaluated on these paths. For a foliage mode, only links with foliage are evaluated again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from .predict import CorrectedMaps
 from .tasks import code_digest
 from .workers import InProcess, Lost, Workers
 
-# Modes of the trees, from no loss to total loss. The paper uses the last mode.
+# Foliage modes, from no loss to total loss. The paper uses the last mode.
 FOLIAGE = ("none", "attenuating", "opaque")
 
 # Short names of layers.
@@ -62,7 +62,8 @@ INTERPOLATORS = ("Kriging", "makima", "spline")
 ZARR = "maps.zarr"
 
 # A map with more than _TILED_ABOVE receivers (positions times heights) is written in tiles with _TILE_CELLS positions
-# per side (about 0.7 MB per tower, height and foliage mode). SHOWN_POSITIONS of them are drawn and exported.
+# per side (about 0.7 MB per tower, height and foliage mode). Only SHOWN_POSITIONS of its positions are drawn and
+# exported.
 _TILED_ABOVE, _TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
 
 
@@ -85,12 +86,12 @@ class MapSettings:
     budget : LinkBudget
         Transmit power, receiver noise and the threshold of coverage.
     elements, element_spacing : int, float
-        Elements of the linear arrays at both ends, along north, and their spacing in wavelengths.
+        Number of elements of the linear arrays at both ends, which are along north, and their spacing in wavelengths.
     max_depth : int
         Largest number of reflections.
     neighbours, radius_m : int, float
-        M and r0 of the interpolators. If the spacing is larger than the paper's, the radius grows so that it contains M
-        positions.
+        Number of neighbours M and radius r0 of the interpolators. If the spacing is larger than the paper's, the radius
+        is increased until it contains M positions.
     block_m : float
         Side of the held-out blocks.
     study : bool
@@ -99,7 +100,7 @@ class MapSettings:
         Seed of random samples.
     tile_m : float, optional
         Side of the tiles of a map that is written tile by tile. Default: :data:`_TILE_CELLS` positions for more than
-        :data:`_TILED_ABOVE` receivers, else the map is made in one piece.
+        :data:`_TILED_ABOVE` receivers. A smaller map is computed in one piece.
     """
 
     foliage: tuple[str, ...] = FOLIAGE
@@ -161,10 +162,10 @@ def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -
     Parameters
     ----------
     site : str
-        Site whose key ``coverage`` has a carrier and a link budget.
+        Site whose key ``coverage`` specifies a carrier and a link budget.
     chosen : mapping
         Fields of :class:`MapSettings` and of its link budget, which replace those of the site. None means not chosen. A
-        threshold replaces either threshold of the site.
+        threshold replaces the thresholds of the site for both level and SNR.
     quick : bool
         Use :data:`QUICK` instead of the paper's defaults.
 
@@ -255,7 +256,7 @@ class SiteChannels:
         }  # fmt: skip
 
     def empty(self, grid: Grid) -> dict[str, MapResult]:
-        """Return maps without coverage, by foliage mode."""
+        """Return empty maps, without coverage, by foliage mode."""
         self._take_site(replace(self.reach.site, towers={}))
         return self._maps(grid)
 
@@ -303,7 +304,7 @@ class SiteChannels:
         return grids.Evaluation(siso, mimo, spread, placed(some.singular_values))
 
     def _rss_dbm(self, h: units.ComplexArray) -> units.FloatArray:
-        """Return the level for channels (..., n_rx, n_tx) with equal feeds in phase, mean over the UAV's elements."""
+        """Return the level of channels (..., n_rx, n_tx) with equal feeds in phase, averaged over UAV elements."""
         amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
         return rss_dbm((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), self.settings.budget.tx_power_dbm)
 
@@ -367,7 +368,7 @@ def level_sd_db(h: units.ComplexArray) -> units.FloatArray:
 
 # --- the job -------------------------------------------------------------------------------------------------------
 
-# Number of draws of M random samples, because the best interpolator differs between draws.
+# Number of draws of M random samples. Several are needed, because the best interpolator differs between draws.
 DRAWS = 10
 
 
@@ -375,10 +376,10 @@ DRAWS = 10
 class MapOutcome:
     """All results of one run.
 
-    ``maps`` has the maps by foliage mode. For a map in tiles, they are at the positions in ``tiles``. ``studies`` has
-    one study per treatment of positions out of coverage. They are missing ("missing"), have rank 0 ("zero"), or have
-    rank 0 with M random samples instead of the M nearest ("random"). ``draws`` has the scores of "random" for
-    :data:`DRAWS` draws. ``blocks`` has the errors of each interpolator on held-out square blocks.
+    ``maps`` contains the maps by foliage mode. For a map in tiles, they are at the positions in ``tiles``. ``studies``
+    contains one study per treatment of positions out of coverage: these are missing ("missing"), have rank 0 ("zero"),
+    or have rank 0 with M random samples instead of the M nearest samples ("random"). ``draws`` contains the scores of
+    "random" for :data:`DRAWS` draws. ``blocks`` contains the errors of each interpolator on held-out square blocks.
     """
 
     site: Site
@@ -395,11 +396,11 @@ class MapOutcome:
 
     @property
     def shown(self) -> MapResult:
-        """The maps of the paper's mode."""
+        """The maps of the foliage mode that is shown."""
         return self.maps[self.settings.shown]
 
     def ordered(self) -> list[tuple[str, MapResult]]:
-        """Return foliage modes and maps, the paper's mode first."""
+        """Return foliage modes and maps, the mode with the largest loss first."""
         return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
 
 
@@ -441,7 +442,7 @@ def make_maps(
     crew = workers or InProcess()
     share = partial(stages.progress, "maps")
     tile_cells = None if out is None else settings.tile_cells(grid)
-    # make four tiles per worker, because with one tile each, all workers would wait for the slowest worker
+    # make four tiles per worker: with one tile per worker, all workers would wait for the slowest one
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
     tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
     with stages("maps"):
@@ -495,7 +496,7 @@ def _write_tiles(
         )
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
     outcome.maps, outcome.paths = tiling.joined(map(store.read, range(len(tiling))), step)
-    # the study needs close neighbours, which every n-th position does not have
+    # the study needs close neighbours, which a selection of every n-th position does not contain
     outcome.settings = replace(outcome.settings, study=False)
     outcome.tiles = {"tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step}
 
@@ -509,7 +510,7 @@ def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
 
 
 def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[PlannedStage]:
-    """Return the stages of a map for its dry run. One position is mapped, so that errors of the map appear."""
+    """Return the stages of a map for its dry run. One position is mapped, so that errors are found in the dry run."""
     grid = Grid.over_area(place.area_m, settings.spacing_m)
     first_m = np.append(grid.points_m[0, :2], min(settings.rss_altitudes_m, default=30.0))
     SiteChannels(place, settings).of(settings.shown)(first_m[None])
@@ -566,7 +567,7 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
 
 
 def _far_reaching(outcome: MapOutcome) -> dict[str, interpolation.Predictor]:
-    """Return interpolators without a limit of distance, for held-out blocks."""
+    """Return interpolators without a distance limit, for held-out blocks."""
     neighbours = outcome.settings.neighbours
     return {
         "Kriging": OrdinaryKriging(outcome.studies["missing"].fit, neighbours, outside="nearest"),
@@ -746,7 +747,7 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
 
 
 def _notes(outcome: MapOutcome) -> tuple[str, ...]:
-    """Return notes on the link budget, on foliage loss beyond its table, and on tiles."""
+    """Return notes about the link budget, foliage loss beyond its table, and tiles."""
     note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
     notes = [outcome.settings.budget.sentence(), *([] if note is None else [note])]
     if outcome.tiles:

@@ -48,7 +48,8 @@ class ReportDiff:
     first, second : mapping
         ``folder``, ``flight``, ``generated`` (time) and ``version`` of each report.
     settings, versions : tuple of mapping
-        ``key`` of each value that differs, with its values ``first`` and ``second``, None if a report does not have it.
+        ``key`` of each value that differs, with its values ``first`` and ``second``. A value is None if a report does
+        not have it.
     inputs : tuple of mapping
         ``role`` and ``path`` of each input file that differs, and ``what``: "added", "removed" or "changed".
     levels, ranks : tuple
@@ -58,7 +59,7 @@ class ReportDiff:
     links_first_only, links_second_only : tuple of str
         Links that only the first, or only the second, report has.
     remarks : tuple of str
-        Limits of the comparison, and numbers that look wrong.
+        Limits of the comparison, and numbers that may be wrong.
     """
 
     first: _Row
@@ -195,7 +196,7 @@ def _table(place: Path, kind: str, columns: Sequence[str]) -> Any:
     texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
     with parsing(path, f"the table {kind}.csv in the folder of metrics.json", "a damaged or edited file"):
         content = read_bounded(path, LARGEST_TABLE, f"{kind}.csv")
-        # a tower may be named NA or nan; read in chunks, a column could get two types
+        # a tower may be named NA or nan; if the table were read in chunks, a column could get two types
         table = pd.read_csv(BytesIO(content), dtype=texts, keep_default_na=False, na_values=[""], low_memory=False)
     if not content.endswith(b"\n"):
         raise InputError("the last line does not end", cause="a truncated copy", path=path, line=len(table) + 1)
@@ -235,7 +236,7 @@ def _same_flight(first: ReadReport, second: ReadReport) -> None:
 
 
 def _learned_here(first: ReadReport, second: ReadReport) -> Iterator[str]:
-    """Yield a remark on the links of each report whose model was learned from this flight's log."""
+    """Yield, for each report, a remark about the links whose model was learned from a log of this flight."""
     for side in (first, second):
         if names := [" ".join(link).strip() for link, n in links_of(side.metrics["rss"]).items() if n.get(KEY)]:
             yield f"{side.place}: {', '.join(names)}: learned from this flight's own log, so errors are not compared."
@@ -254,7 +255,7 @@ def _links(side: ReadReport) -> set[str]:
 
 
 def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys and plain values of nested settings. Entries of a list have their number as key."""
+    """Yield dotted keys and plain values of nested settings. The key of a list entry is its number."""
     if isinstance(value, Mapping) and value:
         for name, item in value.items():
             yield from flat(item, f"{key}.{name}" if key else str(name))
@@ -292,12 +293,12 @@ def _matched(mine: Any, theirs: Any) -> tuple[Overlap, Any, Any]:
     """Return the rows of two tables of one link at common times. Rows with the same time keep their order."""
 
     def keyed(table: Any) -> Any:
-        # logs without times of day have seconds after the first sample
+        # for logs without times of day, use seconds after the first sample
         instant = table["time_utc"].where(table["time_utc"] != "", table["time_s"].map("{:.4f}".format))
         return table.assign(_key=instant, _turn=instant.groupby(instant).cumcount()).set_index(["_key", "_turn"])
 
     first, second = keyed(mine), keyed(theirs)
-    # in the usual case of two reports of the same logs, avoid the join, which would take most of the time
+    # two reports of the same logs are the usual case: avoid the join, which would take most of the time
     if first.index.equals(second.index):
         return Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
@@ -332,7 +333,7 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> Iterator[tuple[LevelDiffere
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
         their_numbers = theirs.metrics["rss"].get(tower, {}).get(channel)
         if their_numbers is None or numbers.get(KEY) or their_numbers.get(KEY):
-            continue  # do not compare errors on training logs
+            continue  # training logs have no errors to compare
         tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (mine, theirs)]
         overlap, a, b = _matched(*tables)
         first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
@@ -432,7 +433,7 @@ DIFFERENCE = {
     "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
 }
 
-# Number of differences that the first sentence names if the RMSE are equal.
+# Number of differences that the first sentence names if both RMSE are equal.
 _NAMED = 2
 
 
@@ -447,7 +448,7 @@ def verdict(diff: ReportDiff) -> str:
 
 
 def _numbers(diff: ReportDiff) -> str:
-    """Return a sentence about the RMSE over all links, or the first differences if the RMSE are equal."""
+    """Return a sentence about the RMSE over all links, or the first differences if both RMSE are equal."""
     scored, pooled = [level for level in diff.levels if level.rmse.n], diff.pooled
     if pooled is None or all(abs(item.rmse.difference_db) <= TOLERANCE_DB for item in scored):
         more = len(diff.differences) - _NAMED

@@ -45,7 +45,7 @@ class Explanation:
     power_sum_dbm : float
         Sum of the paths' powers.
     absent : tuple of (str, str)
-        Missing direct path or ground reflections, with the reason.
+        Direct path or ground reflections that are missing, with the reason.
     """
 
     flight: str
@@ -87,9 +87,11 @@ def run_explain(
     ----------
     flight : Path
     time : str
-        Seconds after the first sample of the tower, or ISO 8601 (in the time zone of the flight if it has no offset).
+        Seconds after the first sample of the tower, or ISO 8601 (in the time zone of the flight if the text has no UTC
+        offset).
     tower : str
-        A tower of the site. If the flight has no log of it, the link is explained at the times of the telemetry.
+        A tower of the site. If the flight has no log of this tower, the link is explained at the times of the
+        telemetry.
     channel : str, optional
         Channel of the RSS logs, or "rank" for the rank log. Default: the first series of the tower. For a tower without
         a log: a key of ``link.channels``, or by default ``link.rss``.
@@ -170,7 +172,7 @@ def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | Ra
 
 
 def _unlogged(data: FlightData, tower: str, channel: str | None) -> RssSeries:
-    """Return a series without levels for a tower that the flight has no log of, every second of the telemetry."""
+    """Return a series without levels, one sample per second of telemetry, for a tower without a log in the flight."""
     assert data.track is not None
     links = {"rss": data.settings.link.rss, **data.settings.link.channels}
     name = channel or "rss"
@@ -223,7 +225,7 @@ def _instant(text: str, first: Any, zone: str | None) -> Any:
 def _pose(
     data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
 ) -> tuple[Link, Poses, list[str], Times]:
-    """Return the link and pose that the report uses for a sample, notes, and the time (1,) by the telemetry clock."""
+    """Return the link and pose that the report uses for a sample, notes, and the time (1,) on the telemetry clock."""
     notes: list[str] = []
     if isinstance(series, RssSeries):
         time = series.time

@@ -1,6 +1,6 @@
-"""One flight from its data to its numbers: clocks, replay, comparison, audit. Every job on a flight starts here.
+"""One flight from its data to its numbers: clocks, replay, comparison, audit. Every job about a flight starts here.
 
-To add a stage, write a function of the earlier stages, add a field to :class:`FlightRun` or
+To add a stage, write a function of the results of earlier stages, add a field to :class:`FlightRun` or
 :class:`~aerpaw_cmp.compare.result.FlightResult`, and two lines to :func:`run_flight`.
 
 The model comparison finds antennas, attitude, ground, buildings and trees that fit the measurement. Its stages
@@ -54,7 +54,7 @@ from .compare_flight import Levels, compare_flight, fitted_receiver, levels_of
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any real field.
 _WEAK_GROUND_DB = 10.0
 
-# Smaller reductions of the RMSE are not visible on a page [dB].
+# Smallest reduction of the RMSE that is visible on a page [dB].
 _SHOWN_DB = 0.1
 
 # Largest number of samples per series. A longer series is thinned.
@@ -62,7 +62,7 @@ _MOST_SAMPLES = 4000
 
 AS_SET = "as set in flight.yaml"
 _FREE_SPACE = BASELINE_TITLE["free_space"]
-# Models without a replay. A replay must have a smaller error than these to be useful.
+# Models without a replay. To be useful, a replay must have a smaller error than these models.
 LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
 
 # Added to the name of a model that would be scored on its training data.
@@ -73,7 +73,7 @@ Ground = Literal["none", "coherent", "weakened", "power sum"]
 Trees = Literal["none", "p833", "opaque"]
 Relief = Literal["flat", "offsets", "surface"]
 
-# Names of the sums and losses of the ground reflection.
+# Names for the ways of adding the ground reflection.
 _GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "power sum": "incoherent"}
 
 
@@ -136,12 +136,12 @@ class Model:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightComparison:
-    """The scored models, in the order of ``scores.candidates``. A model of None is that of the flight file.
+    """The scored models, in the order of ``scores.candidates``. The model None is that of the flight file.
 
     Parameters
     ----------
     offered : mapping of str to str
-        Names of learned antennas that the site offers and the flight file does not use.
+        Names of learned antennas of the site that fit the flight and that the flight file does not use.
     """
 
     scores: ModelComparison
@@ -158,7 +158,7 @@ class FlightComparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Series:
-    """One thinned series: ``rows`` (m,) of its samples, and the indices ``picked`` (m,) of their replayed poses."""
+    """One thinned series: indices ``rows`` (m,) of its samples, and indices ``picked`` (m,) of their replayed poses."""
 
     replayed: Replayed
     levels: Levels
@@ -186,7 +186,7 @@ def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: Rs
 
 
 class _ModelSearch:
-    """The evaluation of models on the series of a flight, with one search per set of paths."""
+    """The evaluation of models on the series of a flight. Each set of paths is searched only once."""
 
     def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
         self._data, self._series = data, series
@@ -210,7 +210,7 @@ class _ModelSearch:
         candidates = self._lines()
         models: list[Model | None] = [None] * len(candidates)
         best = Model()
-        # woods first: their loss is larger than the effect of a reflection and would hide it
+        # try woods before reflections: their loss is larger than the effect of a reflection and would hide it
         for stage in (self._antennas, self._trees, self._ground, self._buildings, self._relief):
             for model in stage(best):
                 if model not in models:
@@ -231,9 +231,9 @@ class _ModelSearch:
         return self._better_than_set(self._by_flights_left_out(comparison), comparison)
 
     def _better_than_set(self, *comparisons: FlightComparison) -> FlightComparison:
-        """Return the first comparison whose recommended model is significantly better than the flight as set.
+        """Return the first comparison whose recommended model is significantly better than the settings of the flight.
 
-        Otherwise the flight as set is recommended, or no model if the flight is a training flight without a score.
+        Otherwise these settings are recommended, or no model if the flight is a training flight without a score.
         """
         better = (each for each in comparisons if self._is_better(each.scores) and not self._contradicts(each))
         scores, last = comparisons[-1].scores, len(comparisons[-1].scores.candidates) - 1
@@ -243,10 +243,10 @@ class _ModelSearch:
         return next(better, dataclasses.replace(comparisons[-1], scores=scores))
 
     def _contradicts(self, comparison: FlightComparison) -> bool:
-        """Check whether a model ignores the attitude that its learned antennas were learned with.
+        """Check whether a model ignores the attitude with which its learned antennas were learned.
 
-        The training flights of the antennas are stronger evidence than a part of one flight: on a third of a flight
-        such a model was 0.4 dB better, and on the complete flight 2.1 dB worse.
+        The training flights of the antennas are stronger evidence than a part of one flight: on a third of a flight, a
+        model without attitude was 0.4 dB better, and on the complete flight 2.1 dB worse.
         """
         chosen = comparison.scores.recommended
         model = None if chosen is None else comparison.models[chosen]
@@ -255,9 +255,10 @@ class _ModelSearch:
         return model is not None and known and (model.antennas, model.attitude) == ("learned", "ignored")
 
     def _is_better(self, scores: ModelComparison) -> bool:
-        """Check that a recommended model is better than the flight as set and than a constant, over all series.
+        """Check that a recommended model is better than the flight's settings and than a constant, over all series.
 
-        The constant is needed because at one position every model is only an offset, and the flattest model is best.
+        The test against a constant is needed, because at a single position every model is only an offset, and the
+        flattest model has the smallest error.
         """
         if scores.recommended is None:
             return False
@@ -272,7 +273,7 @@ class _ModelSearch:
         return True
 
     def _by_flights_left_out(self, comparison: FlightComparison) -> FlightComparison:
-        """Recommend the learned model as calibrated, if it beats free space on held-out flights."""
+        """Recommend the learned model as calibrated, if it has a smaller error than free space on held-out flights."""
         antennas = (self._offer or self._data.settings).learned
         errors = [errors_elsewhere(antennas, series)[0] for series in self._data.rss]
         known = [error for error in errors if error is not None]
@@ -333,7 +334,7 @@ class _ModelSearch:
 
     @cached_property
     def _reliefs(self) -> dict[Relief, Site]:
-        """The site on each other ground of its file, if the flight has flat ground and no additional node."""
+        """The site with each other ground model of its file, if the flight has flat ground and no additional node."""
         data, flat = self._data, self._data.site
         if flat.dem or flat.scene or data.settings.towers or any(t.ground_m for t in flat.towers.values()):
             return {}
@@ -369,7 +370,7 @@ class _ModelSearch:
         return CandidateModel(model=AS_SET, level_db=levels, seconds=seconds)
 
     def _of_flight(self, seconds: Sequence[float]) -> float:
-        """Return the seconds of a flight. Channels with a common replay are counted once."""
+        """Return the seconds for a flight. Channels with a common replay are counted once."""
         shared: dict[tuple[str, str], float] = {}
         for series, cost_s in zip(self._data.rss, seconds, strict=True):
             key = series.tower, series.settings_key
@@ -405,7 +406,7 @@ class _ModelSearch:
         return level, series.step * (search_s + time.perf_counter() - begin)
 
     def _paths(self, index: int, model: Model) -> tuple[Replay, PathSet, FloatArray | None, float]:
-        """Return the replay, its paths for a model, their losses [dB], and the time that they took [s]."""
+        """Return the replay, its paths for a model, the losses of these paths [dB], and the computing time [s]."""
         # antennas and attitude do not change paths and losses
         key = self._like[index], dataclasses.replace(model, antennas="isotropic", attitude="ignored")
         if key not in self._lost:
@@ -420,7 +421,7 @@ class _ModelSearch:
         return self._lost[key]
 
     def _traced_for(self, index: int, model: Model) -> tuple[Replay, float]:
-        """Return the replay between single elements, and the time that it took [s]."""
+        """Return the replay between single elements, and its computing time [s]."""
         direct = model.relief != "flat" and model.ground == "none"  # the search of reflections off terrain is slow
         key = self._like[index], model.buildings, model.relief, direct
         if key not in self._traced:
@@ -491,7 +492,7 @@ def recommended_changes(
         if current[section].get(key) != value
     }
     rt = stated.get("rt") or {}
-    # no model has diffraction: it was the best on none of 28 real series
+    # no model includes diffraction, because it was not the best model on any of 28 real series
     changes |= {("rt", "diffraction"): None} if "diffraction" in rt else {}
     if isinstance(stated.get("site"), str):
         of_site = {key: changes.pop(("site", key)) for section, key in list(changes) if section == "site"}
@@ -531,16 +532,16 @@ _NOT_RECOMMENDED = UsageError(
 
 
 def recommended_text(settings: FlightFile, comparison: FlightComparison | None, flight: Path) -> tuple[str, str]:
-    """Return the flight file with the lines changed that the recommended model needs, and a sentence on them.
+    """Return the flight file with the lines changed as the recommended model requires, and a sentence about them.
 
     Raises
     ------
     UsageError
-        If no models were compared: too few samples of RSS, or rays of another engine than the image method.
+        If no models were compared, because there are too few samples of RSS, or the engine is not the image method.
     """
     if comparison is None or comparison.scores.recommended is None:
         raise _NOT_RECOMMENDED
-    # read bytes, so that line ends stay as they are
+    # read bytes, so that line ends are not changed
     text = unsealed(flight.read_bytes().decode("utf-8"))
     if comparison.recommended is None:
         return text, f"No model is significantly better than {flight.name}: the recommended file is a copy of it."
@@ -666,11 +667,12 @@ def next_step(data: FlightData, result: FlightResult, comparison: FlightComparis
     Returns
     -------
     str or None
-        A clause, by default that of the comparison. None for a training flight.
+        The next step as a clause, by default that of the comparison. None for a training flight.
     """
     beyond = [panel for panel in result.rss if panel.score.at_edge]
     if beyond:
-        # the offset is added to the measurement; 10 dB more, so that the new optimum is not at an edge
+        # the offset is added to the measurement. Extend the range by 10 dB more, so that the new optimum is not at an
+        # edge.
         missing = [float(np.nanmedian(panel.simulated_dbm - panel.measured_db)) for panel in beyond]
         low, high = data.settings.rss.span_db
         ends = (

@@ -1,4 +1,4 @@
-"""Likely cause of a flight's error: the evidence from its replayed series, and causes that the logs show directly."""
+"""Likely cause of a flight's error: the evidence from its replayed series, and causes that are visible in the logs."""
 
 from __future__ import annotations
 
@@ -73,10 +73,11 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     cause = flight_cause(evidence)
     late = _late_clock(evidence)
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
-    # prefer the test of the clock, which knows gains over directions, to a pattern; it does not know obstacles
+    # prefer a wrong clock to an antenna pattern, because the clock test allows for gains over directions. It does not
+    # allow for obstacles.
     if late is not None and (cause is None or CATCH_ALL in cause.name.split(" or ")):
         return late, None
-    # errors by direction are expected if a named antenna could not be used; a caution contains the reason
+    # errors that depend on direction are expected if a named antenna could not be used; a caution contains the reason
     if any(not c.used for c in data.settings.cautions) and by_direction:
         return None, "see the first caution: a learned antenna that the flight file names is not used"
     # learned antennas, of the flight file or of `report --with`, have an error of some decibels on each flight
@@ -94,7 +95,7 @@ def _late_clock(evidence: Sequence[LevelEvidence]) -> Cause | None:
         if clock is None or not clock.shifted:
             continue
         low, high = clock.ci95_s
-        # if the interval is wider than the lag, the levels are late in only part of the flight
+        # if the interval is wider than the lag, the levels may be late in only a part of the flight
         if high - low <= abs(clock.radio_minus_telemetry_s) and fall_without_lag_db(here) >= SHOWN_DB:
             late.setdefault(clock.in_words, []).append(tower)
     if not late:
@@ -112,10 +113,10 @@ def _late_clock(evidence: Sequence[LevelEvidence]) -> Cause | None:
 
 
 def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
-    """Return by how much the RMSE of some channels falls if the lags of their clocks are corrected [dB].
+    """Return the reduction of the RMSE of some channels by a correction of their clock lags [dB].
 
-    It is 0 unless the RMSE also falls if a share of the slow level is fitted: a gain control reduces slow changes of
-    the level, so that the rest seems to be early.
+    The result is 0 unless the RMSE is also reduced after a share of the slow level was fitted. A gain control reduces
+    slow changes of the level, so that the remaining changes seem to be early.
     """
     squares = list[list[AnyArray]]()  # errors of each channel, first without a gain control, then with each
     for e in channels:
@@ -149,7 +150,7 @@ def is_simulated(telemetry: Stream) -> bool:
     signs = [bool((rows[name] == value).all()) for name, value in _RECEIVER.items() if (rows[name] >= 0).any()]
     if "battery_v" in rows and len(rows) >= _FEWEST_VOLTAGES:
         volts = rows["battery_v"].dropna().to_numpy()
-        # in steps of 0.1 V, any battery has few different voltages
+        # skip logs with steps of 0.1 V, in which any battery has few different voltages
         if len(volts) and (np.abs(volts * 10.0 - np.round(volts * 10.0)) > 1e-6).any():
             commonest = np.sort(np.unique(volts, return_counts=True)[1])[-3:]
             signs.append(bool(commonest.sum() >= _SHARE_OF_VOLTAGES * len(volts)))
@@ -170,9 +171,9 @@ SIMULATED = Cause(
 
 
 def heights_meant(telemetry: Stream) -> str | None:
-    """Return the unit of logged heights in words if their changes do not fit the logged vertical speed.
+    """Return a clause about the unit of logged heights if their changes do not fit the logged vertical speed.
 
-    The text is empty if they fit. Return None if the speeds cannot decide.
+    The text is empty if the changes fit. Return None if the speeds do not determine the unit.
     """
     rows, time_s, place_m = path_of(telemetry.frame)
     speed_mps = telemetry.frame[list(_SPEED)].to_numpy(np.float64)[rows] * [1.0, 1.0, -1.0]
@@ -182,7 +183,7 @@ def heights_meant(telemetry: Stream) -> str | None:
     flown, expected = flown[near], expected[near]
     if min(np.abs(expected[:, :2]).sum(), np.abs(expected[:, 2]).sum()) < _LEAST_PATH_M:
         return None
-    # the ratio along the ground shows a wrong unit of the speeds, which does not concern the heights
+    # compare with the ratio along the ground, because a wrong unit of the speeds changes both ratios
     along, upwards = (
         (flown[:, axes] * expected[:, axes]).sum() / np.square(expected[:, axes]).sum() for axes in (slice(2), 2)
     )
@@ -192,14 +193,15 @@ def heights_meant(telemetry: Stream) -> str | None:
     return next((m for m, to_m in meanings.items() if abs(upwards * to_m - along) < _SAME_RATIO * along), None)
 
 
-# Factor to metres by meaning of the heights.
+# Factor that converts the heights to metres, by their meaning.
 _HEIGHTS = {"the logged heights are in feet": FOOT_M, "the logged heights were divided by 3.28": 1.0 / FOOT_M}
-# In four field logs, heights change by 0.90 to 1.00 of the logged speed. Longer steps [s] do not determine the path.
+# In four field logs, heights change by 0.90 to 1.00 of the logged speed. Time steps longer than the third number [s]
+# are not used, because the path within them is unknown.
 _SAME_RATIO, _LEAST_FIT, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 
-# Below this RMSE no cause is searched, because receivers and positions are not more accurate.
+# No cause is searched for if the RMSE is below this [dB], because receivers and positions are not more accurate.
 _GOOD_DB = 1.0
 
 
@@ -254,7 +256,7 @@ def _evidence(
     patterns, rotation = replayed.link.uav_array.patterns, replayed.poses.rotation
     kinds = {"learned": any(isinstance(p, SpherePattern) for p in patterns) or replayed.learned is not None,
              "isotropic": all(isinstance(p, Isotropic) for p in patterns), "measured": True}  # fmt: skip
-    # the setting does not change levels of isotropic antennas, and an unknown gain turns with the aircraft
+    # isotropic levels do not depend on the attitude, and an unknown gain rotates with the aircraft
     if kinds["isotropic"] and replayed.track is not None and replayed.track.attitude_known.any():
         rotation = replayed.track.rotation
     directions = link.directions(link.place_m, replayed.poses.position_m, rotation)
@@ -293,12 +295,12 @@ def _evidence(
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Direct:
-    """The level of the direct path of a series at its poses (m,) [dBm], as set and with faults.
+    """The level of the direct path of a series at its poses (m,) [dBm], with the flight's settings and with faults.
 
     Parameters
     ----------
     rotations : mapping of (str, bytes) to array
-        The attitudes by meaning of the telemetry and times, shared by all channels.
+        Attitudes by meaning of the telemetry and times. All channels share them.
     """
 
     site: Site
@@ -316,14 +318,14 @@ class _Direct:
         return not all(isinstance(pattern, Isotropic) for pattern in self.replayed.link.uav_array.patterns)
 
     def turned_db(self) -> dict[float, FloatArray]:
-        """Return levels with the UAV turned clockwise, by the angle [deg]. Empty for isotropic antennas."""
+        """Return levels with the UAV rotated clockwise, by the angle [deg]. Empty for isotropic antennas."""
         rotation = self.replayed.poses.rotation
         # headings count clockwise, angles of a mount counter-clockwise
         angles = _ANGLES_DEG if self._has_pattern else ()
         return {angle: self.level(rotation=turned(-angle) @ rotation) for angle in angles}
 
     def raised_db(self) -> dict[float, FloatArray]:
-        """Return levels with the UAV at other heights, by the difference [m]."""
+        """Return levels with the UAV at other heights, by the difference of height [m]."""
         positions = {rise: self.replayed.poses.position_m + np.array([0.0, 0.0, rise]) for rise in _RISES_M}
         return {
             rise: self.level(position_m=position_m, tower=True)
@@ -347,9 +349,9 @@ class _Direct:
         return np.asarray(free_space_dbm(self.place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
 
     def displaced_db(self, known_db: FloatArray) -> dict[tuple[float, float], FloatArray]:
-        """Return levels with the tower elsewhere, by distance [m] and azimuth [deg].
+        """Return levels with the tower moved, by distance [m] and azimuth [deg] of the move.
 
-        ``known_db`` is the level with the tower in its place.
+        ``known_db`` is the level with the tower at its position.
         """
         poses = self.replayed.poses
         n = len(poses.position_m)
@@ -387,13 +389,13 @@ class _Direct:
             return {}
         begin_m = data.track.pose_at(np.array([data.track.start_ns], dtype="datetime64[ns]")).position_m[0, :2]
         mirrored_m = np.column_stack([begin_m + (position_m[:, :2] - begin_m)[:, ::-1], position_m[:, 2]])
-        # without attitude, level flight along the course is assumed, and the course is mirrored as well
+        # without a logged attitude, level flight along the course is assumed, so mirror the course as well
         course = used != "ignored" and not track.attitude_known.any()
         rotation = turned(90.0) @ self.replayed.poses.rotation.transpose(0, 2, 1) if course else None
         levels = {_MIRRORED: self.level(position_m=mirrored_m, rotation=rotation, tower=True)}
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
-                # channels with the same times share the attitude
+                # share the attitude between channels with the same times
                 key = meaning, time.tobytes()
                 if key not in self.rotations:
                     self.rotations[key] = data.track.rotations_if(meaning, time)
@@ -407,7 +409,7 @@ class _Direct:
         return {name: self.level(place_m=of.position_m[None, :]) for name, of in towers if name != self.tower}
 
     def directions(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
-        """Return the directions between a place and the UAV, in the frames of both antennas."""
+        """Return the directions between a position and the UAV, in the frames of both antennas."""
         (tower_array,) = self.replayed.link.tower_arrays.values()
         mounts = {"uav_mount": self.replayed.link.uav_array.mount, "tower_mount": tower_array.mount}
         return rss.link_geometry(place_m, position_m, rotation, **mounts)
@@ -420,9 +422,9 @@ class _Direct:
         rotation: FloatArray | None = None,
         tower: bool = False,
     ) -> FloatArray:
-        """Return free space and the mean gain of the UAV's antenna [dB] with the tower, UAV or attitude elsewhere.
+        """Return free space and the mean gain of the UAV's antenna [dB] with other positions or attitudes.
 
-        ``tower`` adds the gain of the tower's antenna, which changes where the direction from the tower does.
+        ``tower`` adds the gain of the tower's antenna. Set it if the direction from the tower changes.
         """
         link, poses = self.replayed.link, self.replayed.poses
         place_m = self.place_m if place_m is None else place_m
@@ -437,7 +439,7 @@ class _Direct:
 
 
 _MIRRORED = "east and north of the track are swapped"
-# Distances [m] and azimuths [deg] of the tower from its place, and number of poses at which these places are computed.
+# Distances [m] and azimuths [deg] by which the tower is moved, and number of poses at which the levels are computed.
 _RADII_M, _AZIMUTHS_DEG = (25.0, 40.0, 65.0, 105.0, 170.0, 275.0), tuple(22.5 * i for i in range(16))
 _DISPLACED_POSES = 300
 # Number of poses at which the other changes of the level are computed.

@@ -19,7 +19,8 @@ from ..live.feed import Feed
 from ..live.ports import Stop, TapSettings, TapStatus, TapSummary
 from ..live.tap import Tap
 
-# Environment variable with the token of a page beyond the loopback, so that the token is the same after a restart.
+# Environment variable with the token of a page that is served beyond the loopback. With it, the token is the same after
+# a restart.
 TOKEN = "AERPAW_CMP_WEB_TOKEN"
 
 
@@ -51,7 +52,7 @@ def tap_modems(
     Parameters
     ----------
     settings : TapSettings
-        Settings of each modem. ``port``, and for several modems a folder in ``folder``, are set here.
+        Settings of each modem. This function sets ``port`` and, for several modems, a subfolder of ``folder``.
     ports : sequence of str or None
         None means the first AT port of a Quectel modem.
     shown : Shown
@@ -79,9 +80,9 @@ def tap_modems(
         if shown.web is not None:
             feed = Feed(names)
             _serve(stack, feed, twin, shown, ", ".join(names))
-        stop = stack.enter_context(Stop())  # an earlier signal ends the process: no log is open yet
+        stop = stack.enter_context(Stop())  # an earlier signal ends the process, because no log is open yet
         alone = len(ports) == 1
-        # not in parallel, because each predictor replays the planned route
+        # create predictors one after the other, because each of them replays the planned route
         predictors = [None if twin is None else twin.predictor() for _ in ports]
 
         def session(number: int) -> TapSummary:
@@ -135,7 +136,7 @@ def _names(paths: Sequence[str]) -> list[str]:
 
 
 def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str, Any]:
-    """Return the text and the commands that the page shows at the end."""
+    """Return the text and the commands that the page shows after the tap has ended."""
     records, gaps = sum(s.records for s in summaries), sum(s.gaps for s in summaries)
     lost = sum(s.lost_records for s in summaries)
     at = time.strftime("%H:%M:%S", time.gmtime())

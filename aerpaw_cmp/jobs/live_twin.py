@@ -49,9 +49,9 @@ class LiveTwin:
         Parameters
         ----------
         flight : Path
-            flight.yaml. Link, tower and the middle K of its ``rank`` are used.
+            flight.yaml. Its link, its tower and the middle K of its ``rank`` are used.
         telemetry : Path, optional
-            The growing log. Default: the first telemetry log of the flight file.
+            The growing telemetry log. Default: the first telemetry log of the flight file.
         """
         settings = load_with_learned(flight)
         site = choose_site(settings.site, flight.parent)

@@ -41,7 +41,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
     options : RunOptions
         ``out`` is ``reports/locate-NAME`` by default.
     channel : str, optional
-        Channel of the levels, by default the first one in the logs.
+        Channel of the levels, by default the first channel in the logs.
 
     Returns
     -------
@@ -50,7 +50,8 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
     Raises
     ------
     UsageError, InputError
-        If there is no telemetry or no such channel, or the levels are too few or do not determine a position.
+        If there is no telemetry or no channel of this name, there are too few levels, or they do not determine a
+        position.
     """
     settings, stages = load_with_learned(flight), Stages(options.progress)
     inputs = inputs_of_flight(settings, flight, options.logs_root)
@@ -119,7 +120,7 @@ def _antennas(
 
 
 def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -> list[str]:
-    """Return sentences on antennas that the flight file names and that the search does not use."""
+    """Return sentences about antennas that the flight file names but the search does not use."""
     own = [c for c in settings.cautions if c.key != "rank.receiver" and c.channel in (None, channel)]
     texts = [f"{caution.key}: {caution.text}." for caution in own]
     texts += [

@@ -54,9 +54,9 @@ _MOST_TARGETS = 600
 # Number of headings at target points without a heading.
 HEADINGS = 4
 
-# Largest number of corners of an area: geofences are drawn by hand.
+# Largest number of corners of an area. Geofences are drawn by hand and have far fewer.
 _MOST_CORNERS = 10_000
-# A target completely outside the geofence, or a geofence outside the site, is refused beyond this distance [m].
+# A target is refused if all of it is farther than this outside the geofence, and so is a geofence outside the site [m].
 _FARTHEST_M = 1000.0
 
 # Shares of the battery for the curve over flight time.
@@ -72,7 +72,7 @@ class PlanOptions:
     Parameters
     ----------
     minutes, speed_mps : float
-        Battery and speed.
+        Flight time of the battery [min], and speed [m/s].
     heights_m : tuple of float
         Heights of the tool's patterns, above take-off.
     tower_distance_m : float
@@ -82,7 +82,7 @@ class PlanOptions:
     avoid : tuple of Path
         KMLs of no-fly areas.
     routes : tuple of Path
-        Further candidates.
+        Files of additional candidate routes.
     towers : tuple of str
         Towers whose antennas are considered, if no flight names them.
     target : TargetOptions
@@ -102,7 +102,7 @@ class PlanOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """A candidate flight: its route, its pattern (None for a file), why it is refused, and the SD after it [dB]."""
+    """A candidate flight: route, pattern (None for a file), reason for a refusal, and SD after the flight [dB]."""
 
     route: Route
     pattern: Pattern | None = None
@@ -134,7 +134,7 @@ def _plan_flight(
     Returns
     -------
     PlanPage
-        Candidates, best first, the files of the best one, and the standard deviation before and after it.
+        Candidates, best first, the files of the best candidate, and the standard deviation before and after it.
 
     Raises
     ------
@@ -272,7 +272,7 @@ def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """Return the tool's patterns, without those that leave the area between legs."""
     out = []
     for height, (azimuth, turns), nose in product(plan.heights_m, [(0.0, False), (90.0, False), (0.0, True)], NOSES):
-        # a pattern with turns on its legs has all headings, regardless of the nose setting
+        # a pattern with turns contains all headings, so other nose settings would be repetitions
         if turns and nose != "along":
             continue
         pattern = Pattern(azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)
@@ -294,7 +294,7 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
             raise InputError("not a route", expected="a .plan, KML, CSV or log with two points or more", path=path)
         place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
         steps = np.diff(place, axis=0)
-        # if the file has no yaw, the nose points along the course
+        # if the file does not specify the yaw, the nose points along the course
         yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))
         ground = site.takeoff_ground_m
         points = [
@@ -312,12 +312,12 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
 
 
 def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
-    """Return the waypoints without those on a straight line between their neighbours with the same yaw."""
+    """Return the waypoints, omitting those with unchanged yaw on a straight line between their neighbours."""
     place = np.array([(w.east_m, w.north_m, w.height_m) for w in points])
     corners = [points[0]]
     for i in range(1, len(points) - 1):
         before, after = place[i] - place[i - 1], place[i + 1] - place[i]
-        # the cosine of about one degree
+        # straight: the course changes by less than about one degree
         straight = float(before @ after) > 0.9998 * float(np.linalg.norm(before) * np.linalg.norm(after))
         if not straight or abs(points[i].yaw_deg - corners[-1].yaw_deg) > 2.0:
             corners.append(points[i])
@@ -335,7 +335,7 @@ def _leaves_area(route: Route, area: Any) -> bool:
 
 
 def _targets(points: sources.Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
-    """Return target points per antenna (all directions if ``points`` is None), at all headings if none is given."""
+    """Return target points per antenna (all directions if ``points`` is None), at all headings if unspecified."""
     out = {}
     for antenna, end in ends.items():
         tower = np.asarray(site.towers[end[0]].position_m)
@@ -386,7 +386,7 @@ def _even_directions(count: int) -> FloatArray:
 
 
 def _flown_flights(series: Sequence[LinkSamples]) -> FlownFlights:
-    """Return strengths and spatial correction learned from earlier flights, else the defaults of the model."""
+    """Return the flights with strengths and spatial correction learned from them, else with the model's defaults."""
     model, residual_field = GainModel(), None
     if series:
         model = learned_antennas(series).model
@@ -396,7 +396,7 @@ def _flown_flights(series: Sequence[LinkSamples]) -> FlownFlights:
 
 
 def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
-    """Return at most ``most`` samples of a target. The step and the number of headings have no common factor."""
+    """Return at most ``most`` samples of a target. Odd steps are used, so that all headings are selected."""
     step = max(1, math.ceil(len(samples) / most))
     step += int(step > 1 and step % 2 == 0)
     return samples.part(np.arange(0, len(samples), step))
@@ -406,7 +406,7 @@ def _rms_of_antennas(sd_db: Mapping[str, FloatArray]) -> FloatArray:
     return np.asarray(np.sqrt(np.mean([sd**2 for sd in sd_db.values()], axis=0)))
 
 
-# Number of best candidates tried at each flight time, because with fewer legs another pattern may be better.
+# Number of best candidates that are tried for each flight time. With less time, another pattern may be the best.
 _CURVE_OF = 3
 
 
@@ -426,7 +426,7 @@ def _curve(
             sd = leaves_db(raised)
             tried.append({"minutes": raised.duration_s / 60.0, "length_m": raised.length_m, "sd_db": sd})
         for point in sorted(tried, key=lambda point: point["sd_db"])[:1]:
-            least = min([point["sd_db"], *(p["sd_db"] for p in out)])  # a longer flight can include the shorter one
+            least = min([point["sd_db"], *(p["sd_db"] for p in out)])  # a longer flight can contain a shorter flight
             out.append(point | {"sd_db": least})
     return out
 

@@ -30,7 +30,7 @@ from ..site.site import Site
 from .compare_flight import compare_flight
 from .options import RunOptions
 
-# Tower and channel of an RSS series. A rank series has ``"rank"`` as its channel.
+# Tower and channel of an RSS series. The channel of a rank series is ``"rank"``.
 Series = tuple[str, str]
 
 
@@ -62,7 +62,7 @@ def open_flight(
     Raises
     ------
     UsageError, InputError
-        If the flight file or a log is wrong. The message names the likely cause.
+        If the flight file or a log is wrong. The message states the likely cause.
 
     Examples
     --------
@@ -110,7 +110,7 @@ class Flight:
     written : FlightFile, optional
         Settings of the flight file before learned antennas are added. Default: those of ``data``.
     changed : tuple of str
-        Keys whose settings differ from the file.
+        Keys whose values differ from the file.
     """
 
     path: Path
@@ -205,7 +205,7 @@ class Flight:
         Parameters
         ----------
         folder : path
-            Folder of the report. A report of this tool is replaced; other files only with ``force``.
+            Folder of the report. A report of this tool is replaced. Other files are replaced only with ``force``.
         force : bool
         options
             Fields of :class:`aerpaw_cmp.jobs.run.ReportOptions`.
@@ -213,7 +213,7 @@ class Flight:
         Raises
         ------
         UsageError
-            If this flight was opened with overrides, because a report describes a file.
+            If this flight was opened with overrides, because a report describes the flight file.
         """
         if self.changed:
             raise UsageError(

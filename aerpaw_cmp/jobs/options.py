@@ -9,7 +9,7 @@ from typing import Any
 
 from ..common.stages import Plan, Progress, Stages, logged
 
-# A sample is scored by the nearest predicted position of another program within this distance [m].
+# Largest distance from a sample to the predicted position of another program by which it is scored [m].
 AGAINST_DISTANCE_M = 5.0
 
 # Largest height of positions of maps and predictions [m]. Drones fly lower; a larger number is a typing error.
@@ -21,7 +21,7 @@ RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOptions:
-    """Options of a run: folders of results and logs, what may be replaced, workers and progress.
+    """Options of a run: folders of results and logs, permission to replace files, workers and progress.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class RunOptions:
     logs_root : Path, optional
         Folder to which the paths of logs are relative.
     force : bool
-        Also replace files that this tool did not write or that were changed since. Inputs are never replaced.
+        Also replace files that this tool did not write, or that were changed since then. Inputs are never replaced.
     workers : int
         Processes on this machine. 1 computes in this process.
     scheduler : str, optional
@@ -50,7 +50,7 @@ class RunOptions:
     dry: bool = False
 
     def stages(self, job: str, inputs: Iterable[Path], output: Path) -> Stages:
-        """Return the stages of a job. The stages of a dry run end the job before it computes."""
+        """Return the stages of a job. In a dry run, they end the job before it computes."""
         plan = Plan(job=job, inputs=tuple(inputs), output=output) if self.dry else None
         return Stages(self.progress, plan=plan)
 
@@ -60,7 +60,7 @@ DEFAULT = RunOptions()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobOutcome:
-    """The outcome of a job that did not fail.
+    """The outcome of a job that ran to its end.
 
     Parameters
     ----------
@@ -70,9 +70,9 @@ class JobOutcome:
     files : tuple of Path
         Files that were written, the page first.
     failed_checks : tuple of str
-        Stated checks that failed.
+        Sentences about requested checks that failed.
     warnings : tuple of str
-        Sentences for the terminal, if they are not in the metrics.
+        Sentences for the terminal that are not in the metrics.
     """
 
     folder: Path

@@ -27,7 +27,7 @@ NEAR_M = 150.0
 def paper_rows(outcome: MapOutcome) -> Iterator[PaperRow]:
     """Yield all rows in the order of the paper, if the map has the towers and the link budget of the paper.
 
-    Rows of the interpolation study are included only if it was made.
+    Rows of the interpolation study are included only if the study was made.
     """
     if not {f"LW{n}" for n in range(1, 6)} <= set(outcome.site.towers) or outcome.settings.budget != PAPER_BUDGET:
         return

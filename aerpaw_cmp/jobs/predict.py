@@ -1,7 +1,7 @@
 """The ``predict`` job: levels with intervals, serving tower and ranks at positions without a flight.
 
-The file also corrects maps by flights: raw replay, prediction, its standard deviation, and the ranks of a learned
-receiver. Levels of a map are in dBm, without the mean offset between the logs and the raw replay.
+The module also corrects maps by flights: raw replay, prediction, standard deviation, and ranks of a learned receiver.
+Levels of a map are in dBm, without the mean offset between the logs and the raw replay.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ from .sources import (
 # Number of headings with equal weights that are used if the heading is not known.
 HEADINGS = 8
 
-# Largest number of targets per block, which limits memory.
+# Largest number of targets per block. It limits the memory that is used.
 AT_ONCE = 50_000
 
 # Column of the probability of lock, for receivers that can lose it.
@@ -76,7 +76,7 @@ _TILE_M = 100.0
 # Largest number of targets at which the channel matrices of a receiver are evaluated.
 MOST_RANKED = 50_000
 
-# Distance that is equivalent to a turn of 60 degrees when the nearest ranked target is chosen [m].
+# Distance that counts as much as a turn of 60 degrees when the nearest ranked target is chosen [m].
 _NOSE_M = 50.0
 
 _FLAG_CODES = {name: code for code, name in enumerate(["", *pages.FLAGS])}
@@ -87,7 +87,7 @@ Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """A prediction: the record of its page, and further data for maps."""
+    """A prediction: the record of its page, and additional data for maps."""
 
     page: pages.PredictionPage
     targets: Targets
@@ -134,7 +134,7 @@ def predict(
     Raises
     ------
     UsageError, InputError
-        If no source shares a tower and band, or there is no position to predict.
+        If no source has a tower and band of the target, or there is no position to predict.
     """
     stages, options = stages or Stages(), options or TargetOptions()
     with stages("read"):
@@ -249,7 +249,7 @@ def site_of(
     where : Path or None
     flights : sequence of NamedFlight
     known : sequence of FlightData
-        Data of the flights, which must share the frame of the site.
+        Data of the flights. All sites must have the same frame.
     named : str, optional
         ``--site``.
 
@@ -302,7 +302,7 @@ def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions)
     link = LinksSettings().rank if flight is None else flight.link.rss
     carrier_hz = options.carrier_hz or (stated.carrier_ghz or 0.0) * 1e9 or link.carrier_hz
     powers = (options.tx_power_dbm, stated.tx_power_dbm, link.transmit_power_dbm)
-    budget = LinkBudget(tx_power_dbm=next(p for p in powers if p is not None))  # refuses a power in watts
+    budget = LinkBudget(tx_power_dbm=next(p for p in powers if p is not None))  # refuse a power in watts
     return Prior(site, LinkSettings(carrier_hz=carrier_hz, transmit_power_dbm=budget.tx_power_dbm))
 
 
@@ -326,7 +326,7 @@ def _check_shared(where: Path, sources: Mapping[str, Source], nodes: frozenset[s
 def _best_model(
     targets: Targets, sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path, remarks: list[str]
 ) -> Flown:
-    """Return the model that predicts the named flights best.
+    """Return the model with the best held-out predictions of the named flights.
 
     Parameters
     ----------
@@ -360,7 +360,7 @@ def _bases(
 ) -> tuple[dict[str, Base], dict[str, list[MeasuredPattern | FlightFile]]]:
     """Return the candidate models, and the learned patterns and settings that they use.
 
-    A model that was learned from the same flights is not a candidate.
+    A model that was learned from these flights is not a candidate, because it cannot be scored on them.
     """
 
     def each(gain: Callable[[Source, LinkSamples], FloatArray]) -> Base:
@@ -454,7 +454,7 @@ def _table(
 
 
 def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
-    """Return the columns (n,) of a level: median, standard deviation, interval, and P(lock) if lock can be lost."""
+    """Return the columns (n,) of a level: median, SD, interval, and P(lock) if the receiver can lose its lock."""
     lock = model.lost_lock(antenna, level_db) if isinstance(model, Memory) else None
     if lock is None:
         fading = model.fading(antenna)
@@ -500,7 +500,7 @@ def _in_parts(targets: Targets) -> Iterator[tuple[IntArray, float]]:
 
 
 def _turns(yaw_deg: FloatArray) -> FloatArray:
-    """Return the headings that replace unknown ones [deg], or a single one if all are known."""
+    """Return the headings that are tried for unknown headings [deg], or a single value if all headings are known."""
     count = 1 if np.isfinite(yaw_deg).all() else HEADINGS
     return np.asarray(np.arange(count) * (360.0 / HEADINGS))
 
@@ -508,11 +508,11 @@ def _turns(yaw_deg: FloatArray) -> FloatArray:
 def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArray:
     """Return the probability (series, n) that each tower is the strongest of its channel.
 
-    The method is Gauss-Hermite quadrature over the level of the tower, with independent levels of the towers.
+    The method is Gauss-Hermite quadrature over the level of the tower. The levels of towers are independent.
     """
     from scipy.special import ndtr
 
-    # at each value of the tower's level, the other towers are independent
+    # for a given level of the tower, multiply the probabilities that the other towers are weaker
     nodes, weight = np.polynomial.hermite_e.hermegauss(24)
     out: AnyArray = np.where(np.isfinite(level), np.float32(1.0), np.float32(np.nan))
     # a tower without a path never serves
@@ -566,7 +566,7 @@ def _ranks(
             continue
         position, yaw, each = targets.position_m[some], targets.yaw_deg[some], []
         turns = _turns(yaw).tolist()
-        few = len(some) * len(turns) <= MOST_RANKED  # all headings at once only for few targets, which limits memory
+        few = len(some) * len(turns) <= MOST_RANKED  # rank few targets at all headings at once, to limit memory
         asked = [turns] if few and not np.isfinite(yaw).any() else [[turn] for turn in turns]
         for together in asked:
             heading = np.where(np.isfinite(yaw), yaw, together[0])
@@ -577,7 +577,7 @@ def _ranks(
                 poses=Poses(position, rotation_from_aircraft(0.0 * heading, 0.0 * heading, heading)),
                 rank=np.full(len(some), np.nan),
                 link=link,
-                # points of a grid are hours apart, so that a receiver that averages over seconds does not mix them
+                # set points of a grid hours apart, so that a receiver that averages over seconds does not mix them
                 time_s=targets.time_s[some] if targets.kind == "route" else 1e4 * np.arange(float(len(some))),
             )
             each.append(receiver.forecast(samples, [turn - together[0] for turn in together])[0])

@@ -63,7 +63,7 @@ _EXPECTED = (
 # A file of more bytes, or with more rows (towers times positions), is refused: a row needs 200 bytes of memory.
 _MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 
-# A prediction is refused as a prediction of another area if all its positions are farther from the site's origin [m].
+# If all positions of a prediction are farther than this from the site's origin [m], it is refused as another area's.
 _FAR_M = 50_000.0
 
 # A larger level or loss [dB] is a fill value: no radio link loses 400 dB.
@@ -78,7 +78,7 @@ Read = tuple[pd.DataFrame, dict[str, Any]]
 # Scores of channels (see :func:`_series`) or of models.
 Entries = Sequence[Mapping[str, Any]]
 
-# A sample is scored by the nearest predicted time within this [s], or within half of the prediction's step.
+# A sample is scored by the nearest predicted time within this [s], or within half of the time step of the prediction.
 _NEAR_S = 0.5
 
 
@@ -121,7 +121,7 @@ class ForeignPrediction:
 
     @property
     def timed(self) -> bool:
-        """True if the rows are matched by time, else by position."""
+        """True if the rows are matched by time, false if by position."""
         return bool(self.table["time"].notna().any())
 
 
@@ -199,7 +199,7 @@ def _csv(content: bytes, path: Path) -> Read:
 
 
 def _check_rows(rows: int) -> None:
-    """Refuse a prediction with more than :data:`_MOST_ROWS` rows before its table is made."""
+    """Refuse a prediction with more than :data:`_MOST_ROWS` rows, before a table is created."""
     if rows > _MOST_ROWS:
         expected = "fewer positions or times; positions far from the route are not needed"
         raise InputError(f"the prediction has more than {_MOST_ROWS} rows", expected=expected)
@@ -215,7 +215,8 @@ def _netcdf(content: bytes, path: Path) -> Read:
     if "up_m" in known:
         known.setdefault("height_m", known["up_m"])
     if "h_real" in known:
-        # level_db of channel.nc may differ in unit between towers, and may have been learned from this flight
+        # ignore level_db of channel.nc: its unit may differ between towers, and it may have been learned from this
+        # flight
         known.pop("level_db", None)
         power_dbm = float(notes["attributes"].get("transmit_power_dbm", 0.0))
         (dims, real), (_, imaginary) = known["h_real"], known["h_imag"]
@@ -280,7 +281,7 @@ def _emulated(folder: Path, data: FlightData) -> Read:
         )
         for o in observe([twin])[0]
     )
-    # a hover has many levels at one position: their mean is what the emulator predicts there
+    # a hover has many levels at one position, so use their mean as the prediction of the emulator
     frame = every.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False).mean()
     return frame, {"unit": ", ".join(sorted({s.unit for s in twin.rss}))}
 
@@ -293,7 +294,7 @@ def _drafted(folder: Path, data: FlightData) -> FlightFile:
     return parse_yaml(drafts(files, folder, DraftOptions(timezone=timezone, site=site))[0].text, FlightFile)
 
 
-# Reader by the first bytes of a file. Other files are CSV.
+# Reader by the first bytes of a file. Files with other bytes are read as CSV.
 _READERS = {b"\x89HDF\r\n\x1a\n": _netcdf, b"PK\x03\x04": _radio_map}
 
 
@@ -335,7 +336,7 @@ def _checked(frame: pd.DataFrame, data: FlightData) -> tuple[str, pd.DataFrame]:
         raise InputError(f"rows without a time and without a position {columns}", expected=_EXPECTED)
     _check_numbers(table, quantity)
     if quantity == "path_loss_db":
-        # a large loss is a low level, so the ends of the band are swapped
+        # a large loss is a low level, so swap the ends of the band
         table = table.rename(columns={"q05_db": "q95_db", "q95_db": "q05_db"})
         table[list(_LEVELS)] *= -1.0
     _check_repeats(table)
@@ -354,7 +355,7 @@ def _times(given: pd.DataFrame) -> Any:
     column = given[name].dropna()
     text, numeric = column.astype(str), pd.api.types.is_numeric_dtype(column)
     stamps = pd.to_datetime(text, utc=True, errors="coerce", format="ISO8601")
-    stamps = stamps.where(stamps.dt.year.between(1700, 2200))  # the range of nanoseconds
+    stamps = stamps.where(stamps.dt.year.between(1700, 2200))  # datetime64[ns] cannot store other years
     zoned = text.str.contains(r"Z$|[+-]\d\d:?\d\d$") | (name == "time_utc")
     for wrong, found, expected in (
         (text[stamps.isna() | numeric], "that cannot be read", "ISO 8601 in UTC, such as 2025-06-10T14:00:00Z"),
@@ -461,7 +462,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     Raises
     ------
     InputError
-        If none of the predictions is near a sample.
+        If no prediction is near a sample.
     """
     series = {item.name: entry for item in result.rss if (entry := _series(given, item, data))}
     ranks = {item.tower: r for item in result.rank if (r := _ranks(given, item, data))}
@@ -473,7 +474,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
             path=given.path,
         )
     name, predicted, every = given.path.name, set(given.table["tower"]), list(series.values())
-    # means over different channels could not be compared
+    # compare only models with all channels: means over different channels are not comparable
     models: Mapping[str, Any] = max((entry["cards"] for entry in every), key=len, default={})
     common = {link: entry for link, entry in series.items() if entry["cards"].keys() >= models.keys()}
     means = [_means(model, [entry["cards"][model] for entry in common.values()]) for model in models]
@@ -508,7 +509,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
 
 
 def _means(model: str, cards: Entries) -> dict[str, Any]:
-    """Return the mean scores of a model over channels. NaN if a channel does not have the number."""
+    """Return the mean scores of a model over channels. NaN if the number is missing for a channel."""
     values = np.array([[card[key] for key in referee.AVERAGED] for card in cards], dtype=np.float64)
     return {"model": model, "channels": len(cards), **dict(zip(referee.AVERAGED, values.mean(axis=0), strict=True))}
 
@@ -540,9 +541,9 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> dict
     """Return the scores of one tower and channel. None if too few samples have a prediction.
 
     ``matched`` and ``unmatched`` count the samples with and without a prediction nearby. ``floor_db`` is the detection
-    floor that the predicted levels show, such as those of an emulated receiver. ``cards`` (of all models with enough
-    levels, on the same samples; the prediction first, then ray tracing and the baselines) and ``differences`` (RMSE of
-    the prediction minus that of the model, each after one offset) are by model.
+    floor that is visible in the predicted levels, for example of an emulated receiver. ``cards`` (of all models with
+    enough levels, on the same samples; the prediction first, then ray tracing and the baselines) and ``differences``
+    (RMSE of the prediction minus that of the model, each after one offset) are by model.
     """
     part = split_by_series(given.table, item.tower, item.channel)
     if given.quantity == "path_loss_db":
@@ -558,9 +559,9 @@ def _series(given: ForeignPrediction, item: RssResult, data: FlightData) -> dict
     same = near & (np.isfinite(level) | ~heard)
     name = given.path.name
     absolute = given.unit in ("", item.unit) if given.quantity == "level_db" else item.unit == "dBm"
-    # by model: its columns, whether it has the reference of the log, and the samples that it covers
+    # for each model: its columns, whether its levels have the reference of the log, and the samples that it covers
     models = {name: (predicted, absolute, near)}
-    if not item.training:  # its antennas were learned from these samples
+    if not item.training:  # otherwise its antennas were learned from these samples
         models[referee.OURS] = {"level": item.simulated_dbm}, item.unit == "dBm", same
     models |= {BASELINE_TITLE[key]: ({"level": of.level_dbm}, False, same) for key, of in item.baselines.items()}
     seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")
@@ -601,12 +602,12 @@ def predicted_at(
     time : (n,) datetime64[ns]
     position_m : (n, 3)
     heading_deg : (n,), optional
-        Headings of the nose.
+        Headings of the UAV.
 
     Returns
     -------
     numbers : dict of str to (n,)
-        By column of the prediction. NaN if no prediction is near.
+        Values by column of the prediction. NaN if no prediction is near.
     near : (n,) bool
         True if a prediction is near.
     """
@@ -666,7 +667,7 @@ def _why_none(given: ForeignPrediction, data: FlightData, result: FlightResult) 
 
 
 def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightResult) -> str | None:
-    """Return the likely error of the predicted heights, if most samples are near a prediction without it."""
+    """Return the likely error of the predicted heights, if most samples are near a prediction after its correction."""
     if given.timed:
         return None
     flown = np.vstack([s.position_m[np.isfinite(s.position_m).all(axis=1)] for s in result.series])

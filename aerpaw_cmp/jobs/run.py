@@ -90,7 +90,7 @@ def run_ingest(
     from ..logs.text import zone
 
     if name := options.get("timezone"):
-        zone(name, needed_by="--timezone")  # a misspelt zone is an error of the command, not of the first log
+        zone(name, needed_by="--timezone")  # report a misspelt zone as an error of the command, not of the first log
     if out is not None and draft is not None and os.path.realpath(out) == os.path.realpath(draft):
         raise UsageError("-o and --draft name the same file", expected="two names", path=draft)
     inputs = [*paths, *([] if site is None else [Path(site)])]
@@ -129,9 +129,9 @@ def _write_drafts(
     try:
         flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
     except UsageError as error:
-        error.others = files  # the account of the files shows what is missing
+        error.others = files  # their account helps to see what is missing
         raise
-    # drafts of further flights are in the folder of the first, because paths in a draft are relative to it
+    # write drafts of further flights to the same folder, because paths in a draft are relative to it
     numbers = range(2, len(flights) + 1)
     places = [draft, *(draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in numbers)]
     remarks = []
@@ -300,7 +300,7 @@ def _check_options(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
 
 
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
-    """Return the settings with those of the command line, the files that they name, and the folder of results."""
+    """Return the settings, changed by the command line, the files that they name, and the folder of results."""
     from ..flight.gains import load_with_learned
     from .tasks import inputs_of_flight
 
@@ -318,7 +318,7 @@ def _with_audit(settings: Any, audit: str | None) -> Any:
     """Return the settings with the number of audited links of the command line."""
     if audit is None:
         return settings
-    # "full" is a number that is larger than the number of links of any flight
+    # represent "full" by a number that is larger than the number of links of any flight
     numbers = {"full": 10**9, "none": 0}
     if audit not in numbers and not audit.isdecimal():
         raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
@@ -327,7 +327,7 @@ def _with_audit(settings: Any, audit: str | None) -> Any:
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
-    """Return the stated checks that failed."""
+    """Return sentences about the requested checks that failed."""
     from ..report.page import links_of
 
     failed = []
@@ -368,7 +368,7 @@ def run_site_import(
     base : str, optional
         Site whose towers and settings are kept. Default: Lake Wheeler if no tower is named.
     towers : sequence of str
-        ``NAME=LATITUDE,LONGITUDE,HEIGHT`` of antennas; the first is the origin if there is no base.
+        ``NAME=LATITUDE,LONGITUDE,HEIGHT`` of antennas. The first antenna is the origin if there is no base.
     force : bool
         Replace a file that this tool did not write.
     **options
@@ -445,7 +445,7 @@ def run_map(
     from .sources import files_of, named_flights
     from .workers import open_workers
 
-    # before the site is read, so that a misspelt flight is reported at once
+    # read the flights before the site, so that a misspelt flight is reported at once
     known = named_flights(flights)
     place, progress = load_site(site), options.progress
     if flights and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
@@ -520,7 +520,7 @@ def run_campaign(
     nodes = soundings(sounded, campaign.timezone) if sounded else ()
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
-    # an address such as s3:// is not a folder; a path has a single slash after the colon
+    # an address such as s3:// is not a folder. As a path, it has a single slash after the colon.
     if keep is not None and ":/" in str(keep):
         raise UsageError(f"--keep {keep}", expected="a folder")
     store = None if fresh else keep or cache_folder("outcomes")

@@ -1,7 +1,8 @@
 """Points and links of a prediction, and the models that predict them.
 
 Points are a grid over a site, a planned route, the plan or track of a flight, or a table. Links are those of the named
-flights, those with learned antennas and levels of the site, or, before any flight, those of all towers.
+flights, or those for which the site has learned antennas and levels. Before any flight, they are the links of all
+towers.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ class Targets:
         The grid, if the points are its positions, in order of height.
     heights_m : tuple of float
     towers : set of str
-        Towers of the levels and ranks of a flight, or those that its file names. Empty if they are not known.
+        Towers of the levels and ranks of a flight, or the towers that its file names. Empty if the towers are not
+        known.
     remarks : tuple of str
     """
 
@@ -258,11 +260,13 @@ def _named(flight: FlightFile) -> frozenset[str]:
 def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
     """Return the upward axes (n, 3) of a multicopter, which leans into its motion."""
     time = np.maximum.accumulate(time_s)
-    # use positions two seconds apart, because they are rounded and an aircraft does not lean faster
+    # use positions two seconds apart, because logged positions are rounded, and an aircraft does not change its lean
+    # faster
     begin, end = np.clip(time - 1.0, time[0], None), np.clip(time + 1.0, None, time[-1])
     moved = interpolated(end, time, position_m) - interpolated(begin, time, position_m)
     up = np.radians(LEAN_DEG_PER_MPS) * moved / np.maximum(end - begin, 1e-9)[:, None]
-    # use this number as the tangent of the lean, so that a jump of the positions cannot turn the aircraft over
+    # with 1 as the upward component, the horizontal part is the tangent of the lean: a jump of the positions cannot
+    # turn the aircraft over
     up[:, 2] = 1.0
     return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
 
@@ -301,7 +305,7 @@ def _local_points(path: Path) -> Targets | None:
         sign = ";" if ";" in head else ","
         if not set(_COLUMNS[:3]) <= {name.strip() for name in head.split(sign)}:
             return None
-        # read one row more than allowed, so that a longer table is refused before all of it is in memory
+        # read one row more than allowed: a longer table is then refused before all of it is in memory
         table = pd.read_csv(
             path, skipinitialspace=True, nrows=MOST_POINTS + 1, encoding="utf-8-sig", index_col=False,
             sep=sign, decimal="," if sign == ";" else ".",  # pandas leaves decimal points as text, converted below
@@ -477,12 +481,12 @@ class Source:
 
 
 def track_m(samples: LinkSamples) -> FloatArray:
-    """Return about 500 positions (n, 2) of a flight, for drawings."""
+    """Return about 500 horizontal positions (n, 2) of a flight, for drawings."""
     return np.asarray(samples.position_m[:: max(1, len(samples) // 500), :2])
 
 
 def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
-    """Return links of fixed towers and the channels that a flight received, by antenna."""
+    """Return the links between fixed towers and the channels that a flight received, by antenna."""
     with_level = (o.samples for o in observed if np.isfinite(o.samples.residual_db).any())
     measured = lists_by_key((samples.antenna, samples) for samples in with_level)
     out: dict[str, Source] = {}
@@ -514,7 +518,7 @@ class Flown:
     Parameters
     ----------
     trained_on : sequence of sequence of str
-        SHA-256 of the training data of its base, in addition to the named flights.
+        SHA-256 of the training data of the base, in addition to the named flights.
     marks : sequence of sequence of str
         Fingerprints of the same data.
     """
@@ -530,16 +534,16 @@ class Flown:
         level, slow = self.correction.over_headings(each)
         known = self.sources[antenna].samples
         guess = outside(each[0].position_m, known)
-        # held-out errors of several flights already contain the change between areas
+        # the held-out errors of several flights already contain the variation between areas
         if len({samples.flight for samples in known}) == 1:
             slow = np.where(guess, np.hypot(slow, between_blocks_db(self.correction.channels[antenna])), slow)
         return level, slow, guess
 
     def fading(self, antenna: str) -> Spread:
-        """Return the spread of samples about their means over 4 s."""
+        """Return the error model of samples about their means over 4 s."""
         known = self.sources[antenna].samples
         sd_db, kurtosis = fading_of(known, BIN_S)
-        # the noise of a mean of n samples already contains 1/n of the variance of their fading
+        # the noise of a mean of n samples already contains 1/n of the variance of the fading
         count, means = sum(np.isfinite(s.residual_db).sum() for s in known), len(self.correction.channels[antenna].rows)
         sd_db *= math.sqrt(1.0 - min(means / count, 1.0))
         return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
@@ -552,12 +556,12 @@ class Flown:
 
 
 class Memory:
-    """The model stored for the site: learned antennas and level of each channel.
+    """The model that is stored for the site: learned antennas and level of each channel.
 
     Parameters
     ----------
     known : mapping of str to LearnedLink
-        By antenna (``tower.channel``), each with a level.
+        Learned links with a level, by antenna (``tower.channel``).
     site : Site
     """
 
@@ -568,7 +572,7 @@ class Memory:
     def levels(self, each: Sequence[LinkSamples]) -> Levels:
         """Return levels in the form of :meth:`Flown.levels`.
 
-        The model extrapolates outside the site and in directions that few training samples have.
+        The model extrapolates outside the site, and in directions with few training samples.
         """
         memory = self.known[each[0].antenna]
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
@@ -578,7 +582,7 @@ class Memory:
         return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + variance_db2), guess
 
     def fading(self, antenna: str) -> Spread:
-        """Return the spread of samples about their means over 4 s."""
+        """Return the error model of samples about their means over 4 s."""
         return dataclasses.replace(self.known[antenna].spread, own_sd_db=0.0, noise_sd_db=0.0)
 
     def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:
@@ -618,7 +622,7 @@ def memory_of(place: str | Path, site: Site) -> Memory | None:
 
 # Standard deviations of a prediction before any flight [dB]. Offset: transmit power, cables and receiver gain, all
 # unmeasured. Antennas: the gain of two unknown antennas over directions (a dipole's nulls, mast, airframe).
-# Shadowing: 3GPP TR 36.777, table B-3, gives 4.2 dB (LoS) and 6 dB (NLoS) for rural aerial links. Fading: Rayleigh's
+# Shadowing: 3GPP TR 36.777, table B-3, has 4.2 dB (LoS) and 6 dB (NLoS) for rural aerial links. Fading: Rayleigh's
 # 5.6 dB is the worst case. `benchmarks/first_flight_prediction.py` checks the sum on flights.
 PRIOR_SD_DB = {"offset": 10.0, "antennas": 8.0, "shadowing": 6.0, "fading": 5.0}
 
@@ -654,7 +658,7 @@ class Prior:
         return level, np.where(np.isfinite(level), slow_sd_db, np.nan), np.ones(len(level), dtype=np.bool_)
 
     def fading(self, _antenna: str) -> Spread:
-        """Return the spread of samples about their means over 4 s."""
+        """Return the error model of samples about their means over 4 s."""
         return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_SD_DB["fading"])
 
 

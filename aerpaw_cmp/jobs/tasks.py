@@ -1,8 +1,8 @@
 """Inputs of a task of a campaign or a map, and its stored outcomes.
 
-The inputs are all files that a report was made from: logs, settings, site, antennas, elevation, reference powers. Every
-value of a flight file or a site file that names a file is an input (:mod:`aerpaw_cmp.common.yamlfile`). An outcome is
-stored under a digest of its inputs, so no finished task is computed twice.
+The inputs are all files from which a report was made: logs, settings, site, antennas, elevation, reference powers.
+Every value of a flight file or a site file that names a file is an input (:mod:`aerpaw_cmp.common.yamlfile`). An
+outcome is stored under a digest of its inputs, so no finished task is computed twice.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ def other_inputs(
     flight : Path
         The flight file.
     logs_root : Path, optional
-        Folder for the paths of logs and antenna files, in addition to that of the flight file.
+        Folder for the paths of logs and antenna files, in addition to the folder of the flight file.
     learned : Path, optional
         calibrated.yaml of ``report --with``.
 
     Returns
     -------
     tuple of InputFile
-        Path as written, SHA-256, and as role the key that names the file. These files have no lines to account for.
+        Path as written, SHA-256, and as role the key that names the file. The lines of these files are not counted.
     """
     content = settings.model_dump(exclude={"logs"})
     roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
@@ -122,7 +122,7 @@ LAYOUT = 8
 _SEAL = b"aerpaw-cmp outcome"
 
 
-# Entry points of readers. Readers of other packages enter the digest with their version.
+# Entry points of readers. The digest contains the versions of readers from other packages.
 READERS = "aerpaw_cmp.readers"
 
 
@@ -134,7 +134,7 @@ class OutcomeStore:
     folder : Path
         It is created when the first entry is written.
     kind : type
-        Dataclass of an outcome. Entries are checked against its fields, and only this class is built from a file.
+        Dataclass of an outcome. Entries are checked against its fields, and no other class is built from a file.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class OutcomeStore:
 
     def __init__(self, folder: Path, kind: type) -> None:
         self.folder = folder
-        # use a list, because pydantic accepts no configuration for a dataclass
+        # wrap the class in a list, because pydantic does not accept a configuration for a dataclass
         self._kind = TypeAdapter(list[kind], config=ConfigDict(arbitrary_types_allowed=True, extra="forbid"))  # type: ignore[valid-type]
         self.warnings: list[str] = []
 
@@ -173,7 +173,7 @@ class OutcomeStore:
         if content is None:
             return None
         try:
-            # a pickle in a shared folder could run code of its writer
+            # do not allow pickles: in a shared folder, they could run code of another user
             with parsing(file, any_shape=True), np.load(io.BytesIO(content), allow_pickle=False) as parts:
                 arrays = {name: parts[name] for name in parts.files}
                 outcome = json.loads(
@@ -200,14 +200,14 @@ _ARRAY = "array of the entry"
 
 
 class _Arrays:
-    """Arrays by name, each stored once, because channels of a tower share times and positions (half of the volume)."""
+    """Arrays by name. Each is stored once: channels of a tower share times and positions (half of the size)."""
 
     def __init__(self) -> None:
         self.by_name: dict[str, AnyArray] = {}
         self._names: dict[tuple[str, tuple[int, ...], bytes], str] = {}
 
     def plain(self, value: Any) -> Any:
-        """Return the name of an array in place of it, and a number of NumPy as a number of Python."""
+        """Return the name of an array instead of the array, and a number of NumPy as a number of Python."""
         if not isinstance(value, np.ndarray):
             return value.item()
         if value.dtype.hasobject:  # NumPy would pickle objects
@@ -217,7 +217,7 @@ class _Arrays:
         return {_ARRAY: name}
 
 
-# Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit.
+# Settings that do not affect the outcome of a task: names, the plan of a simulation, pages, the audit.
 _WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links"}}
 
 
@@ -243,7 +243,7 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
 
 
 def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: object) -> str:
-    """Return the digest of all that an outcome depends on: relevant settings, content of inputs, code, and ``more``.
+    """Return the digest of everything that affects an outcome: settings, content of inputs, code, and ``more``.
 
     Labels are not part of the digest, so a flight or setting with a new name keeps its stored outcomes.
     """
@@ -255,7 +255,7 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
     return digest.hexdigest()
 
 
-# Code, and the tables that code reads: those of the parsers, the dictionary of columns, and weights of the statistics.
+# Code, and the tables that it reads: tables of the parsers, the dictionary of columns, and weights of the statistics.
 _SOURCES = ("**/*.py", "*.yaml", "logs/*.yaml", "compare/*.json")
 
 

@@ -5,7 +5,8 @@ that can be pickled. If a worker process ends, the tasks that it was running are
 worker ends again becomes :class:`Lost`.
 
 Processes of this machine communicate through pipes that no other process can open. A Dask scheduler and its workers
-unpickle what they receive. Every user who can connect can thus execute code, so connections must use TLS.
+unpickle everything that they receive. Every user who can connect can therefore execute code, so connections must use
+TLS.
 """
 
 from __future__ import annotations
@@ -42,13 +43,14 @@ Task = Callable[[Any], Any]
 # A function that receives the number of an item and the result of its task, or :class:`Lost`.
 _OnResult = Callable[[int, Any], None]
 
-# Waiting times [s]: for a scheduler, before a scheduler without workers is reported, and between counts of workers.
+# Waiting times [s]: for a scheduler to answer, before a scheduler without workers is reported, and between counts of
+# workers.
 CONNECT_S, NO_WORKER_S, COUNT_EVERY_S = 10.0, 30.0, 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The replacement of a result if its worker ended twice, or if task or result could not be pickled."""
+    """The result of a task whose worker ended twice, or if the task or its result could not be pickled."""
 
     message: str
 
@@ -76,7 +78,8 @@ class Workers(ABC):
         task : callable
         items : sequence
         on_result : callable
-            Receives the number and the result of each item once, in this process, as soon as the result is known.
+            Receives the number and the result of each item once. It is called in this process, as soon as the result is
+            known.
 
         Raises
         ------
@@ -127,7 +130,7 @@ class Processes(Workers):
 
     def _run_waiting(self, task: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
         active: dict[Future[Any], int] = {}
-        others = multiprocessing.active_children()  # processes that the calling program started itself
+        others = multiprocessing.active_children()  # processes that the calling program started
         with _in_trusted_folder() as folder:
             # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
             pool = ProcessPoolExecutor(min(self.count, len(waiting)), get_context("spawn"), _start_worker, (folder,))
@@ -357,12 +360,12 @@ def check_workers(client: Any, paths: Sequence[Path]) -> None:
 
 
 def _difference(paths: Sequence[str], code: str, version: str) -> str:
-    """Return how this worker process differs from the planning process, or an empty text if it does not differ.
+    """Return how this worker process differs from the planning process, or an empty text if both are equal.
 
     Parameters
     ----------
     paths : sequence of str
-        Files and folders that it must be able to read.
+        Files and folders that the worker must be able to read.
     code, version : str
         Digest of the code and version of the planning process.
 

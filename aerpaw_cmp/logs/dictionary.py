@@ -1,8 +1,8 @@
 """The dictionary of columns: the meaning of a name in any log of any program, and its possible values.
 
 :func:`meaning` returns the quantity of a column by its name: unit, numbers for missing values, possible range, role
-(serving cell, n-th neighbour, uplink) and the datum of a height. ``PROGRAMS`` adds what names alone do not show: units
-and datums that a program is known to write. The rows are in ``dictionary.yaml``, where names are added.
+(serving cell, n-th neighbour, uplink) and the datum of a height. ``PROGRAMS`` adds facts that do not follow from names:
+units and datums that a program is known to write. The rows are in ``dictionary.yaml``. Add new names there.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import yaml
 from ..common.units import BoolArray, FloatArray
 from .records import Kind
 
-# Numbers that Android, modems, autopilots and scripts write for "not available".
-# They are the ends of integer types, including 28 bits (LTE cell identity) and 16 bits (MAVLink), and -999 of scripts.
+# Numbers that Android, modems, autopilots and scripts write for "not available". They are the ends of integer types,
+# including 28 bits (LTE cell identity) and 16 bits (MAVLink), and numbers like -999, which scripts write.
 UNAVAILABLE = (2147483647.0, -2147483648.0, 9223372036854775807.0, 268435455.0, 65535.0, -32768.0, -999.0, -9999.0)
 _ANY = (-np.inf, np.inf)
 
@@ -48,7 +48,7 @@ class Quantity:
     datum : str
         Zero of a height: ``take-off``, ``ground``, ``sea level``, ``ellipsoid`` or ``unknown``.
     open_unit : bool
-        Programs write the quantity in several units: the unit of plain numbers is then unknown.
+        True if programs write the quantity in several units, so that the unit of plain numbers is unknown.
     """
 
     name: str
@@ -67,13 +67,13 @@ class Quantity:
 
 
 _FULL_SCALE = "dB re full scale"
-# Words for a height, which patterns of the file name HEIGHT.
+# Words for a height, written as HEIGHT in the patterns of the file.
 _HEIGHT = r"(alt|altitude|height|hgt|elevation|ele)"
 
 
 def table(path: Path) -> Mapping[str, Any]:
-    """Return a table that belongs to the program, with every value as text."""
-    # PyYAML's C loader, which all its wheels have, reads the dictionary in 10 ms
+    """Return a table that is part of this package, with every value as text."""
+    # the C loader, which all wheels of PyYAML contain, reads the dictionary in 10 ms
     content: Mapping[str, Any] = yaml.load(
         path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader)
     )
@@ -107,7 +107,7 @@ WINTER = {
 
 @cache
 def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
-    """Return one expression per row, so that a single search excludes all patterns of a row for most names."""
+    """Return one expression per row: for most names, a single search then excludes all patterns of the row."""
     return tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
 
 
@@ -119,16 +119,16 @@ class Meaning:
     ----------
     quantity : Quantity
     unit : str
-        The unit in its name, in lower case; empty if there is none.
+        The unit in the name of the column, in lower case. Empty if there is none.
     rat : str
         ``lte``, ``nr`` or empty.
     place : str
-        ``serving``, ``scell1``, ``n2`` (the second neighbour; ``n0`` where it has no number), ``cell2``, ``sim2``.
+        ``serving``, ``scell1``, ``n2`` (the second neighbour; ``n0`` if the name has no number), ``cell2``, ``sim2``.
     indirect : bool
-        True for the uplink, a statistic or a model: the receiver did not measure such a level.
+        True for the uplink, a statistic or a model: such a level was not measured by the receiver.
     part : str
-        ``mean`` for a level averaged over time, ``port`` for that of a single receive port, empty for the cell's own
-        level.
+        ``mean`` for a level averaged over time, ``port`` for the level at a single receive port, empty for the level of
+        the cell.
     """
 
     quantity: Quantity
@@ -152,7 +152,7 @@ _LETTERS = str.maketrans({"\u200b": "", "_": " ", "\u00b5": "u", "\u03bc": "u"})
 
 @cache
 def plain(name: str) -> str:
-    """Return a name in lower case and in English, with its punctuation as single spaces.
+    """Return a name in lower case and in English, with punctuation replaced by single spaces.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def plain(name: str) -> str:
 
 _BRACKETS = re.compile(r"[\[(\uff08]([^\[\]()\uff09]{1,24})[\])\uff09]")
 _BRACKET = re.compile(_BRACKETS.pattern + r"\s*$")
-# The words of 'RsrpDbm' and 'RSRPDbm', but not of 'dBm' and 'eNB'.
+# Boundaries between words in 'RsrpDbm' and 'RSRPDbm', but not in 'dBm' and 'eNB'.
 _CAMEL = re.compile(r"(?<=[a-z])(?<!\b[a-z])(?<!_[a-z])(?<!d[bB]u)(?=[A-Z])(?!Bm?$)|(?<=[A-Z0-9])(?=[dD][bB][mM]?$)")
 _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u03bc%\u00b0]{1,7}(/[a-z]{1,3})?")
 
@@ -182,7 +182,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     name : str
         Name as written in the file, with its unit.
     words : str, optional
-        Its plain form in common words, if the program uses its own words.
+        Plain form of the name in common words, if the program uses words of its own.
 
     Examples
     --------
@@ -203,7 +203,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     ]
     hits = ((row, text) for text in texts for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
-    if row is not None and row.role == "other":  # the name of a tower, target or antenna may precede that of a level
+    if row is not None and row.role == "other":  # a name of a tower or antenna may precede that of a level
         row, text = next((hit for hit in hits if hit[0].role in ("rss", "rank", "kpi", "cell")), (None, ""))
     # 'rx [dBm]' is a level, not the name of a receiver
     if row is None or (row.role == "identity" and is_unit(unit)):
@@ -231,7 +231,7 @@ _OF_WHO = re.compile(r"\b(id|identity|name|no|num|number|index|address|addr)\b")
 
 
 def _split(name: str, what: Meaning | None) -> tuple[str, str]:
-    """Return the words that name a cell other than its PCI, and the words that an identity and a level share."""
+    """Return the words that name a cell, without its PCI, and the words that an identity and a level have in common."""
     bare = re.sub(r"(?<=[a-z])(?=\d)", " ", without_unit(name)[0])
     who, is_quantity = PATTERNS["who"], what is not None and what.quantity.role != "identity"
     kind = "" if is_quantity else " ".join(part[0] for part in who.finditer(bare))
@@ -241,9 +241,10 @@ def _split(name: str, what: Meaning | None) -> tuple[str, str]:
 
 
 def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
-    """Return the meanings of columns. Levels and identities whose names have the same other words share a place.
+    """Return the meanings of columns. Levels and identities with the same other words in their names get one ``place``.
 
-    A place with several identities, such as "PCI A" and "PCI B", has several cells: "RSRP A" is the level of the first.
+    If a place has several identities, such as "PCI A" and "PCI B", it has several cells: "RSRP A" is the level of the
+    first cell.
 
     Examples
     --------
@@ -324,9 +325,10 @@ def in_brackets(name: str) -> tuple[str, str, str]:
 
 
 def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
-    """Return the place of a plain name in the order of preference: first by row, then by pattern."""
+    """Return the position of a plain name in the order of preference: first by row, then by pattern."""
     fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
-    # use ellipsoid heights only if there is no other height: at Lake Wheeler they differ by 33 m from sea level
+    # use ellipsoid heights only if there is no other height: at Lake Wheeler, they differ from heights above sea level
+    # by 33 m
     last = len(QUANTITIES) * (quantity.datum == "ellipsoid")
     return QUANTITIES.index(quantity) + last, fits[0] if fits else len(quantity.names)
 
@@ -346,15 +348,15 @@ def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
 
 def angle_form(values: FloatArray, quantity: Quantity) -> str:
     """Return the unit of positions that are too large for degrees: ``1e-7 deg``, ``ddmm.mmmm`` or an empty text."""
-    # rows before the first fix contain zeros
+    # ignore zeros, which rows before the first fix contain
     known = np.abs(values[np.isfinite(values) & ~is_none(quantity, values) & (values != 0)])
     most = quantity.can_be[1]
-    # use the median, because a few damaged rows do not show another unit
+    # use the median, because a few damaged rows do not prove another unit
     if not len(known) or np.median(known) <= most:
         return ""
     if (known == np.round(known)).all() and np.median(known) > 1e5 and known.max() <= most * 1e7:
         return "1e-7 deg"
-    # minutes end at 60, and degrees have at most three digits before them
+    # minutes are below 60, and at most three digits of degrees precede them
     if known.max() <= 100 * most and (known % 100 < 60).all():
         return "ddmm.mmmm"
     return ""
@@ -369,7 +371,7 @@ def _times(factor: float) -> Callable[[FloatArray], FloatArray]:
 
 def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
     def convert(values: FloatArray) -> FloatArray:
-        # a power of zero has no level in dB, and a negative value is not a power
+        # allow zeros, which have no level in dB, and negative values, which are not powers
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(values >= 0, 10 * np.log10(np.where(values > 0, values, np.nan) * per_unit), np.nan)
 
@@ -382,9 +384,9 @@ _DBUV_OF_0_DBM = 90 + 10 * float(np.log10(50.0))
 
 # Units that a name or a cell may have, by the unit after conversion, with their factors.
 _FACTORS = {unit: {word: float(factor) for word, factor in words.items()} for unit, words in _FILE["units"].items()}
-# Powers by their number of milliwatts, which become dBm.
+# Units of power, by their number of milliwatts. They are converted to dBm.
 _POWERS = {"mw": 1.0, "w": 1e3, "uw": 1e-3, "\u00b5w": 1e-3, "nw": 1e-6, "pw": 1e-9}
-# Each unit: the unit after conversion, and the function that converts it.
+# For each unit, the unit after conversion, and the function that converts values to it.
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: (unit, _times(factor)) for unit, words in _FACTORS.items() for word, factor in words.items()},
     **{word: ("dBm", _milliwatts(factor)) for word, factor in _POWERS.items()},
@@ -392,7 +394,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     "dbw": ("dBm", lambda values: values + 30.0),
     "linear": ("dB", _milliwatts(1.0)),
 }
-# Units of MAVLink's integers: a converter that writes decimals has already scaled them.
+# Units of MAVLink's integers. A converter that writes decimals has already scaled the values.
 OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7", "semicircles")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 _SUFFIXES = _FILE["suffixes"]
@@ -428,7 +430,7 @@ def unit_of(written: str) -> str:
 def converted(values: FloatArray, written: str) -> FloatArray:
     """Return values of a written unit in the unit of the dictionary."""
     if written in _DDMM:
-        degrees = np.trunc(values / 100)  # angles in the format of NMEA
+        degrees = np.trunc(values / 100)  # NMEA format: ddmm.mmmm
         return np.asarray(degrees + (values - 100 * degrees) / 60)
     factor, unit = _scale(written)
     return UNITS[unit][1](values * factor if factor != 1 else values) if unit in UNITS else values
@@ -447,11 +449,12 @@ class Program:
     signs : collection of str
         Sets of plain names. A table that has all names of one set was written by this program.
     words : mapping of str to str
-        Patterns of the program's names, matched against complete plain names, and the dictionary's words for them.
+        Patterns of the names that the program writes, matched against complete plain names, and the words of the
+        dictionary for these names.
     units : mapping of str to str
-        Units of plain names without a unit in brackets; the name ``time`` is the clock.
+        Units of plain names without a unit in brackets. The name ``time`` means the clock.
     datum : str
-        Datum of heights whose name does not contain it.
+        Datum of heights whose name does not contain a datum.
     angles : str
         Unit of angles.
     """
@@ -498,14 +501,14 @@ def is_statistic(name: str) -> bool:
 
 
 def can_be_level(name: str) -> bool:
-    """Check whether the unit in a name, if it is known, is that of a level, not that of a field strength or height."""
+    """Check whether the unit in a name, if it is known, is a unit of levels, and not of field strengths or heights."""
     return UNITS.get(without_unit(name)[1], ("dBm",))[0] in ("dBm", "dB", _FULL_SCALE)
 
 
 def program(names: Collection[str]) -> Program | None:
     """Return the program that wrote a table with such plain names, or None if no program is recognised."""
     present = set(names)
-    if present.isdisjoint(_SIGNS):  # sniffers test lines of any kind
+    if present.isdisjoint(_SIGNS):  # fast exit, because sniffers test lines of any kind
         return None
     return next((item for item in PROGRAMS if any(sign <= present for sign in item.signs)), None)
 
@@ -579,7 +582,7 @@ def record_columns(
         if what is None or what.quantity.role not in ("position", "height", "angle", "velocity", "count"):
             continue
         row = what.quantity
-        # decimals were written by a converter, which has already scaled them
+        # decimals were written by a converter, which has already scaled the values
         unit = "" if unit in OF_INTEGERS and name not in integers else unit
         # 65535 mm may be a height: only the ends of the integer type mean a missing value
         none = np.abs(fields[name]) >= UNAVAILABLE[0] if unit in ("mm", "e7") else is_none(row, fields[name])

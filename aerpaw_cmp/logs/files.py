@@ -1,12 +1,12 @@
-"""Files of logs: archives, packed files, checksums, and files larger than memory in pieces.
+"""Files of logs: archives, packed files, checksums, and reading of files larger than memory in pieces.
 
 Logs packed by gzip, bzip2 or xz are unpacked piece by piece, up to a limit. A file may contain several streams, as
 parallel packers write them.
 
-Zip and tar archives are read as folders of logs: members are streams with a limit and are never written to disk. A
-member is named like a file in a folder: ``dataset.zip/LW1/power_log.txt``.
+Zip and tar archives are read as folders of logs: members are streams with a limit and are never written to disk. The
+name of a member is that of a file in a folder: ``dataset.zip/LW1/power_log.txt``.
 
-A line of the log of ``aerpaw-cmp tap`` is a JSON object; its last key is the CRC-32 of the text before it.
+Each line of the log of ``aerpaw-cmp tap`` is a JSON object. The last key is the CRC-32 of the text before it.
 
 A log larger than memory is read in pieces of complete lines. The result of ``Reader.read_pieces`` does not depend on
 the size of the pieces: a reader stores a few numbers per piece and completes the result at the end.
@@ -65,12 +65,12 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
     Raises
     ------
     InputError
-        If the file is damaged or truncated, or unpacks to more than a log can.
+        If the file is damaged or truncated, or unpacks to more bytes than a log can have.
     """
     name = packed_form(file.read(10)) or "bzip2"
     file.seek(0)
     try:
-        # some Python builds do not have the module
+        # import it here, because some Python builds do not have the module
         module = import_module(_MODULES[name])
     except ImportError as error:
         found = f"a {name} file, and this Python was built without {name}"
@@ -86,7 +86,7 @@ def unpacked_pieces(file: BinaryIO, path: str | Path) -> Iterator[bytes]:
             yield piece
     except EOFError as error:
         raise InputError(f"the {name} file ends too early", cause="a truncated download", path=path) from error
-    # the header of an xz file may ask for more memory than there is
+    # a MemoryError is possible, because the header of an xz file may request more memory than is available
     except (OSError, ValueError, zlib.error, _LZMA_ERROR, MemoryError) as error:
         raise InputError(f"a damaged {name} file ({error})", cause="a truncated download", path=path) from error
 
@@ -106,7 +106,7 @@ def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
 def head_of(place: Path, count: int) -> bytes:
     """Return the first bytes of the content of a packed file, up to the first damage."""
     head = b""
-    # reading the file later reports the damage
+    # do not report damage here, because reading the file reports it later
     with suppress(InputError), place.open("rb") as file:
         for piece in unpacked_pieces(file, place):
             head += piece
@@ -115,20 +115,21 @@ def head_of(place: Path, count: int) -> bytes:
     return head[:count]
 
 
-# Largest number of files in an archive. A flight of half an hour with a burst every 0.1 s has 18 000.
+# Largest number of files in an archive. A flight of half an hour with a burst every 0.1 s has 18 000 files.
 MOST_MEMBERS = 20_000
 # Largest size of a member, and of all members together, after decompression.
 MOST_BYTES = 2**31
 _MOST_IN_ALL = 2**35
-# Largest ratio of all members to the archive, in addition to ``_FREE_BYTES``. Logs shrink to a fifth, some to a 50th.
+# Largest ratio of the size of all members to that of the archive, in addition to ``_FREE_BYTES``. Packing reduces most
+# logs to a fifth, and some to a fiftieth.
 MOST_RATIO = 100
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 _TAR = b"ustar"
 _MARGIN = 2**20
 _FREE_BYTES = 2**28
-# Deflate makes a file at most 1032 times smaller: a larger ratio is false.
+# Deflate makes a file at most 1032 times smaller, so a header with a larger ratio is false.
 _RATIO = 1200
-# Errors of Python's libraries for damaged archives, ValueError for a directory that begins before the file does.
+# Errors of Python's libraries for damaged archives. ValueError: the directory would begin before the start of the file.
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, _LZMA_ERROR, struct.error, EOFError, OSError, ValueError, IndexError,
     OverflowError, NotImplementedError,
@@ -146,7 +147,7 @@ class Member:
     size : int
         Size after decompression according to the archive [bytes].
     read : callable
-        Function that returns the content, or at most the given number of bytes of it.
+        Function that returns the content, or at most the given number of bytes.
     """
 
     name: str
@@ -156,7 +157,7 @@ class Member:
 
 def is_archive(head: bytes) -> bool:
     """Check whether the first bytes of a file (gunzipped or not) are those of an archive."""
-    # the mark of POSIX tar is at byte 257 of the first header
+    # the signature of POSIX tar is at byte 257 of the first header
     return head.startswith(_ZIP) or head[257:262] == _TAR
 
 
@@ -173,8 +174,8 @@ def archive_members(data: bytes, path: str | Path) -> dict[str, Member]:
     Raises
     ------
     InputError
-        If the archive is damaged, or has more files or bytes than a data set can have. ``read`` of a member raises it,
-        too.
+        If the archive is damaged, or has more files or bytes than a data set can have. ``read`` of a member raises the
+        same error.
     """
     try:
         entries = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
@@ -217,7 +218,7 @@ def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, m
 
 
 def _tar(data: bytes, path: str | Path) -> Iterator[Member]:
-    # "r:": no compression, which would be unpacked without a limit
+    # "r:" refuses compressed tar files, which would be unpacked without a limit
     book = tarfile.open(fileobj=io.BytesIO(data), mode="r:")  # noqa: SIM115 - members are read later
     for entry in book.getmembers():
         # skip links, devices and pipes
@@ -242,7 +243,7 @@ def _refused(found: str, expected: str, path: str | Path, _most: int | None) -> 
 
 
 def most_bytes(size: int) -> int:
-    """Return the number of bytes that an archive or packed file of ``size`` bytes may unpack to."""
+    """Return the largest allowed size of the unpacked content of an archive or packed file of ``size`` bytes."""
     return min(_MOST_IN_ALL, MOST_RATIO * size + _FREE_BYTES)
 
 
@@ -341,15 +342,15 @@ def _counted(chunks: Iterable[bytes], digest: Any) -> Iterator[bytes]:
 
 
 class Column:
-    """A column that grows in place: joining stored pieces would need twice the memory."""
+    """A column that grows in place, because joining stored pieces would need twice the memory."""
 
     def __init__(self, dtype: Any) -> None:
-        self._content, self._dtype = bytearray(), dtype  # a bytearray reserves an eighth more, and moves pages
+        self._content, self._dtype = bytearray(), dtype  # a bytearray grows in place, with an eighth in reserve
 
     def extend(self, piece: AnyArray) -> None:
         """Append values."""
         self._content += piece.astype(self._dtype, copy=False).tobytes()
 
     def array(self) -> AnyArray:
-        """Return the column, which then cannot grow."""
+        """Return the column as an array. It cannot grow after that."""
         return np.frombuffer(self._content, dtype=self._dtype)

@@ -12,9 +12,9 @@ Layout (root attributes ``format`` = ``aerpaw-cmp flight``, ``version`` = 1)::
 JSON is stored as UTF-8 bytes, because HDF5 strings cannot contain the NUL characters of damaged logs. Times are
 int64 nanoseconds of UTC. The file can be read without this package.
 
-After the HDF5 data, which HDF5 ignores, come the word ``AERPAWCS`` and the SHA-256 of all bytes before it. Damage is
-thus found before HDF5 reads the file, because HDF5 reads some damaged bytes as data and never returns from others.
-A file without the SHA-256 (truncated, or changed by another program) is checked only by HDF5.
+The HDF5 data are followed by the word ``AERPAWCS`` and the SHA-256 of all bytes before it, which HDF5 ignores. The
+SHA-256 is checked before HDF5 reads the file, because HDF5 would read some damaged bytes as data, and would not return
+after reading others. A file without the SHA-256 (truncated, or changed by another program) is checked only by HDF5.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class IngestedFile:
     Parameters
     ----------
     path : str
-        Path from the user or the folder.
+        Path from the user, or path below the user's folder.
     sha256 : str
         SHA-256 of the content after unpacking, which identifies a log under any name and in any archive.
     result : ReadResult
@@ -67,7 +67,7 @@ class IngestedFile:
 
 
 def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
-    """Write a flight file: a reader sees the old file or the new one, never a part.
+    """Write a flight file atomically: a reader sees the old file or the new file, never a part.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
                 _write_file(shelf.create_group(f"{i:05d}"), file, sink)
     finally:
         sink.raise_spared()  # raise the first failure of the stream, which causes the later errors of HDF5
-    # HDF5 ignores bytes after its own end
+    # append the SHA-256, because HDF5 ignores bytes after the end of its data
     size = stream.seek(0, os.SEEK_END)
     digest = _digest(stream, size)
     stream.seek(size)
@@ -191,13 +191,13 @@ def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> N
 def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
     """Return the numbers of texts, and number new texts.
 
-    pandas.factorize is not used, because up to pandas 2.3 it ends a text at a NUL.
+    pandas.factorize is not used, because up to version 2.3 it cuts texts off at a NUL.
     """
     import numpy as np
     import pandas as pd
 
     cells = part.tolist()
-    # a text column has few different values
+    # convert each different cell once, because a text column has few different values
     texts = {cell: None if pd.isna(cell) else str(cell) for cell in dict.fromkeys(cells)}
     code = {cell: number.setdefault(text, len(number) - 1) for cell, text in texts.items()}
     return np.fromiter(map(code.__getitem__, cells), np.int32, len(cells))
@@ -280,7 +280,7 @@ def _read_column(items: Mapping[str, AnyArray], name: str, kind: str) -> Any:
         return values.astype("datetime64[ns]")
     if kind != "text":
         return values
-    # code -1 selects the last entry, which means that there is no text
+    # code -1 means a missing text: it selects the last entry, None
     words = np.array([*_read_json(items[f"{name}.words"]), None], dtype=object)
     return pd.Series(words[values], dtype=object)
 

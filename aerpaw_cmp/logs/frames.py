@@ -18,7 +18,7 @@ from .flight_file import write_flight
 from .ingest import Ingested, account_notes, ingest, summary
 from .readers import ReadOptions, named_tower
 
-# A file, a folder, or a pattern such as ``"logs/*.txt"``; ``~`` is the home folder.
+# A file, a folder, or a pattern such as ``"logs/*.txt"``. ``~`` means the home folder.
 Source: TypeAlias = str | os.PathLike[str]
 
 
@@ -30,7 +30,7 @@ class Logs(dict[str, pd.DataFrame]):
     """The frames of logs by the name of their stream, with the account of every file.
 
     ``frame.attrs`` contains the attributes of the stream (node, channel, unit, frequency) and its ``reader``, ``file``
-    and ``kind``. If a log does not name its node, the node is the tower in its path (``LW1/power.txt``). If
+    and ``kind``. If a log does not name its node, the node is the tower that the path contains (``LW1/power.txt``). If
     several files have a stream of the same name, the keys are ``<file>:<stream>``, with the folder if necessary.
 
     Parameters
@@ -54,7 +54,7 @@ class Logs(dict[str, pd.DataFrame]):
             place = file_name if alike[file_name, stream.name] == 1 else file.path
             key = stream.name if names[stream.name] == 1 else f"{place}:{stream.name}"
             frame = stream.frame.copy(deep=False)
-            # records have naive times in UTC
+            # add the zone, because records have naive times in UTC
             frame["time"] = pd.to_datetime(frame["time"]).dt.tz_localize("UTC")
             if stream.kind in ("rss", "rank") and (node := named_tower("/".join(Path(file.path).parts[-2:]), _TOWERS)):
                 frame.attrs["node"] = node
@@ -65,7 +65,7 @@ class Logs(dict[str, pd.DataFrame]):
 
     @property
     def account(self) -> dict[str, Any]:
-        """The accepted, rejected and blank lines and the streams of each file, as printed by ``ingest --json``."""
+        """The account of the lines of each file, and its streams, as printed by ``ingest --json``."""
         return summary(self.files)
 
     @property

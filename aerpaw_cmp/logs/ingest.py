@@ -1,6 +1,6 @@
 """Find logs, sniff them, read them and account for every line.
 
-A path named by the user must be readable; inside a folder or an archive, files of unknown kinds are skipped and
+A path that the user names must be readable. Inside a folder or an archive, files of unknown kinds are skipped and
 reported. ``dataset.zip/LW1/power_log.txt`` names a member of an archive.
 """
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Largest packed file that is unpacked in memory [bytes].
 MAX_BYTES = 2**32
 
-# A file with more records per stream than this is a separate log.
+# A file with more records per stream than this is a separate log, not a piece of a log.
 _PIECE_RECORDS = 50
 
 # Number of rejected lines that a summary quotes per file.
@@ -49,7 +49,7 @@ class Skipped:
     Parameters
     ----------
     error : AerpawCmpError, optional
-        A usage error names an option that this file needs, but perhaps not the other files of the folder.
+        A usage error names an option that this file needs. The other files of the folder may not need it.
     """
 
     path: str
@@ -58,13 +58,13 @@ class Skipped:
 
     @classmethod
     def of(cls, path: Path, names: Collection[str], error: AerpawCmpError) -> Skipped:
-        """Return the record of a skipped file: the reason, and for a table the way to read it."""
+        """Return the record of a skipped file: the reason, and for a table the options with which it can be read."""
         way_out = f"; {error.cause}" if "--map" in (error.cause or "") else ""
         return cls(str(path), _samples_of(path.name, names) or error.found + way_out, error)
 
 
 class Ingested(list[IngestedFile]):
-    """The files that were read, in order, and in ``skipped`` the files of folders that were not read."""
+    """The files that were read, in order. ``skipped`` contains the files in folders that were not read."""
 
     def __init__(self, files: Sequence[IngestedFile] = (), skipped: Sequence[Skipped] = ()) -> None:
         super().__init__(files)
@@ -90,7 +90,7 @@ def _unpacked(raw: bytes, path: str | Path) -> bytes:
 
 
 def _raw(place: Path, limit: int = -1) -> bytes:
-    """Return all bytes on disk, or the first ``limit`` bytes."""
+    """Return all bytes of a file on disk, or the first ``limit`` bytes."""
     try:
         if place.is_dir():
             raise InputError("a folder where a log is expected", path=place)
@@ -115,7 +115,7 @@ def ingest(
         Files, folders and archives (zip, tar). Folders are searched recursively, in sorted order; hidden files are
         ignored. For a flight file of ``ingest -o``, its logs are returned.
     options : ReadOptions or callable, optional
-        Facts that are not in the files; a callable returns them per path.
+        Facts that are not in the files. A callable returns the facts for a path.
     reader : str, optional
         Name of the reader. Default: detected by content.
 
@@ -141,7 +141,7 @@ def ingest(
         files += inside
         skipped += skipped_below
     if any(file.result.reader == "generic_csv" for file in files):
-        # the mapped columns belong to one table: the other files of the folder keep their readers
+        # the mapped columns belong to one table: read only tables with them, and other files with their own readers
         refused = [item for item in skipped if isinstance(item.error, UsageError)]
         skipped = [item for item in skipped if item not in refused]
         for item in refused:
@@ -156,7 +156,7 @@ def ingest(
 
 
 def _check_readable(places: Sequence[Path]) -> None:
-    """Raise InputError for all files that cannot be opened, before the minutes that reading a folder may take."""
+    """Raise InputError for all files that cannot be opened, because reading a folder may take minutes."""
     errors = []
     # a path may name a member of an archive, which does not exist on disk
     for place in (place for place in places if not _is_folder(place) and _part_of(place) is None):
@@ -220,12 +220,12 @@ def as_utf8(data: bytes) -> bytes:
         text = data.decode("utf-16", errors="replace")
         # a binary file may begin with the same two bytes
         return data if "\0" in text or text.count("\ufffd") > 8 else text.encode()
-    if b"\n" not in data and b"\r" in data and b"\0" not in data:  # line ends of old versions of Mac OS
+    if b"\n" not in data and b"\r" in data and b"\0" not in data:  # CR: line ends of old versions of Mac OS
         data = data.replace(b"\r", b"\n")
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
-# The methods of Path raise for a name that is too long; read_bytes reports it.
+# Unlike the methods of Path, these functions do not raise an error for a name that is too long. read_bytes reports it.
 _present, _is_folder = os.path.exists, os.path.isdir
 
 
@@ -239,7 +239,7 @@ def _part_of(path: Path) -> tuple[Path, str] | None:
 
 
 def sniffers_of(path: Path) -> list[str]:
-    """Return the names of the readers whose sniffers accept a log, none for a folder or a log in a flight file."""
+    """Return the names of the readers whose sniffers accept a log. Empty for a folder or a log in a flight file."""
     if path.is_dir():
         return []
     if (part := _part_of(path)) is None:
@@ -257,7 +257,7 @@ def _beginning(place: Path, count: int = DEEP_BYTES) -> bytes:
     return as_utf8(head if packed.packed_form(head) is None else packed.head_of(place, count))
 
 
-# Logs of flight files that were read, by the flight file.
+# Logs of flight files that were already read, by flight file.
 Held = dict[Path, list[IngestedFile]]
 
 
@@ -307,7 +307,7 @@ def read_log(
         files = [_of_kind(_source(*part, held), None if reader is None else by_name(reader), part[0])]
     else:
         files = ingest([path], options=options, reader=reader)
-    # a folder of pieces is one log; several logs would get the same node and channel
+    # a folder of pieces is a single log; several logs would get the same node and channel
     if len(files) != 1:
         names = ", ".join(one_line(Path(item.path).name) for item in files[:4])
         raise UsageError(
@@ -328,7 +328,7 @@ def read_log(
 
 
 def _refuse_other_kind(path: Path, reader: Reader) -> None:
-    """Refuse a log that the named reader does not recognise but another reader does: it is the wrong file."""
+    """Refuse a log that another reader than the named reader recognises, because it is the wrong file."""
     if reader.name == "generic_csv":
         return  # the user named the columns of this file
     claimed_by = sniffers_of(path)
@@ -397,7 +397,7 @@ def _member(
 
 
 def _samples_of(name: str, names: Collection[str]) -> str | None:
-    """Return the description of a file of samples with a meta file in the same folder, else None."""
+    """Return the description of a file of samples whose meta file is in the same folder, else None."""
     meta = name.removesuffix(".sigmf-data") + ".sigmf-meta"
     if name.endswith(".sigmf-data") and meta in names:
         return f"not a log: the samples of {Path(meta).name}, read with it"
@@ -425,7 +425,7 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
     data, digest = read_bytes(place)
     data = as_utf8(data)
     if not data.strip() or pointer:
-        identify(data, path=str(path))  # raises the message for an empty file or a pointer
+        identify(data, path=str(path))  # raise the error for an empty file or a pointer
     return _read(place, data, digest, reader or identify(data, path=str(path)), options)
 
 
@@ -448,7 +448,7 @@ def _in_flight_file(path: Path) -> tuple[Path, str] | None:
 
 
 def name_inside(path: str) -> str:
-    """Return the end of a log's path, by which it is found in its flight file.
+    """Return the end of a log's path, by which the log is found in its flight file.
 
     Examples
     --------
@@ -461,7 +461,7 @@ def name_inside(path: str) -> str:
 def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedFile:
     """Return one of the logs in a flight file by its path or by the end of its path."""
     held = {} if held is None else held
-    # read it once for all logs in flight.yaml that refer to it
+    # read the flight file once for all logs in flight.yaml that refer to it
     files = held[flight_file] = held.get(flight_file) or read_flight(flight_file)
     named = [item for item in files if item.path == name or Path(item.path).as_posix().endswith(f"/{name}")]
     if len(named) != 1:
@@ -521,11 +521,13 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     return result
 
 
-# GPS receivers count weeks modulo 1 024 (IS-GPS-200): after a rollover their dates are earlier by this number of days.
+# GPS receivers count weeks modulo 1 024 (IS-GPS-200). After a rollover, their dates are too early by this number of
+# days.
 ROLLOVER_DAYS = 7 * 1024
-# Start of the first LTE networks. Earlier dates of logs are wrong.
+# Start of the first LTE networks. A log with an earlier date has a wrong clock.
 _PLAUSIBLE_FROM = datetime(2009, 12, 1)
-# Dates after this are wrong: counts of LabVIEW (from 1904) and NTP (from 1900), read as Unix time, are after 2080.
+# Dates after this are wrong. For example, counts of LabVIEW (from 1904) and NTP (from 1900) become dates after 2080 if
+# they are read as Unix time.
 _FUTURE = datetime(2050, 1, 1)
 
 
@@ -570,14 +572,15 @@ def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) ->
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     try:
-        # sort by name, so that joined pieces and logs with equal clocks have the same order on every disk
+        # sort by name, because disks list files in different orders, and joined pieces and logs with equal clocks keep
+        # the order
         places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
     is_flight_file = {place: _is_flight_file(place) for place in places}
-    # flight files last, because they may contain logs of the folder
+    # read flight files last, because they may contain logs of the folder
     for place in sorted(places, key=is_flight_file.__getitem__):
-        if not place.is_file():  # links to folders are not followed, because they may form a circle
+        if not place.is_file():  # do not follow links to folders, which may form a circle
             what = "a link to a folder: name that folder as well" if place.is_dir() else "a broken link"
             skipped.append(Skipped(str(place), what))
             continue

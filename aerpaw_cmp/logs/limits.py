@@ -1,19 +1,19 @@
-"""The possible range of each quantity of the record model. Rows outside it are flagged, for all readers.
+"""The possible range of each quantity of the record model. For all readers, rows outside the range are flagged.
 
-A value beyond its range becomes NaN; a position, an attitude or a velocity loses all three components. Its row gets a
-flag, and a warning states the number of such rows and the first row. Rows with a flag of :data:`UNSCORED` stay in
-the records and are not compared.
+A value outside its range becomes NaN. For a position, an attitude or a velocity, all three components become NaN. The
+row gets a flag, and a warning states the number of these rows and the first of them. Rows with a flag of
+:data:`UNSCORED` stay in the records and are not compared.
 
-The ranges are those of physics and of small aircraft. They are wide, because they should find impossible
-values (a corrupted digit, an overflow, a sentinel) and not unusual values.
+The ranges follow from physics and from the performance of small aircraft. They are wide, because they should find
+impossible values (a corrupted digit, an overflow, a sentinel) and not unusual values.
 
 Speeds reveal wrong clocks and positions: no small aircraft flies faster than 100 m/s, or gains 10 m/s in a second.
 
-A few positions that cannot be reached in time from the rows around them are jumps of the receiver. They are flagged and
-read as missing, as is a distant place where a log begins or ends at rest, such as the origin of an autopilot's filter.
-Positions that do not change although a speed is logged are stale. They are also flagged and read as missing.
-If a track is too fast throughout, its times are in another unit. A track in two places at once belongs to two
-vehicles. Both are reported, and their values stay as they are.
+If a few positions cannot be reached in time from the rows around them, the receiver jumped. They are flagged and read
+as missing. So is a distant position at which a log begins or ends at rest, such as the origin of an autopilot's filter.
+Positions that do not change although a speed is logged are stale. They are also flagged and read as missing. If a track
+is too fast throughout, its times are in another unit. If a track is at two positions at the same time, it belongs to
+two vehicles. Both cases are reported, and the values are not changed.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ FASTEST_MPS = 100.0
 FLAG, STALE = "position_jump", "position_stale"
 PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
 
-# A distance above this between two rows of nearly one time is not jitter of a receiver [m].
+# A distance above this between two rows at nearly the same time is not receiver jitter [m].
 _JITTER_M = 15.0
 
-# Largest share of rows that are jumps. Above it, the rows are several tracks, or their times are wrong.
+# Largest share of rows that are jumps. If the share is larger, the rows are several tracks, or their times are wrong.
 _FEW_JUMPS_SHARE = 0.2
 
-# An aircraft gains less speed than this in a second [m/s^2].
+# Largest gain of speed of an aircraft within a second [m/s^2].
 _GAIN_MPS2 = 10.0
 
 # Number of moves on either side of a step from which the speed is estimated.
@@ -104,7 +104,7 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
 
 
 def path_of(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the rows with a time and a position, their times [s], and east, north, up [m] from the first position."""
+    """Return the rows with time and position, their times [s], and east, north, up [m] from the first position."""
     time = frame["time"].to_numpy("datetime64[ns]")
     latitude, longitude = (frame[name].to_numpy(np.float64) for name in PLACE[:2])
     known = np.isfinite(latitude) & np.isfinite(longitude) & ~np.isnat(time) & ((latitude != 0) | (longitude != 0))
@@ -112,15 +112,15 @@ def path_of(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
     if not len(rows):
         return rows, np.zeros(0), np.zeros((0, 3))
     up = frame[PLACE[2]].to_numpy(np.float64)[rows] if PLACE[2] in frame else np.zeros(len(rows))
-    known_up = np.flatnonzero(up > -900.0)  # -999 is what loggers write without a fix
+    known_up = np.flatnonzero(up > -900.0)  # loggers write -999 without a fix
     up = np.interp(np.arange(len(up)), known_up, up[known_up]) if len(known_up) else np.zeros(len(up))
     flat = rough_m(latitude[rows], longitude[rows], (float(np.median(latitude[rows])), longitude[rows[0]]))
     return rows, (time[rows] - time[rows[0]]) / np.timedelta64(1, "s"), np.column_stack([flat, up])
 
 
 def typical_speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
-    """Return the median speed of the moving part, over steps long enough for stamps written in bursts."""
-    # over a fiftieth of the track: loggers write a second's rows in one burst
+    """Return the median speed of the moving part, over steps that are longer than a burst of rows."""
+    # take steps of a fiftieth of the track, because a logger may write the rows of a second in one burst
     apart = max(1, len(time_s) // 50)
     step_m = np.linalg.norm(place_m[apart:] - place_m[:-apart], axis=1)
     step_s = np.abs(time_s[apart:] - time_s[:-apart])
@@ -153,7 +153,7 @@ def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> Callable[[IntArray
         usual_mps = usual[np.searchsorted(moves, np.arange(len(time_s))).clip(0, len(moves) - 1)]
 
     def beyond(first: IntArray, second: IntArray) -> BoolArray:
-        # the sign of the time is ignored, because a clock that steps back is not a jump of the position
+        # ignore the sign of the time, because a clock that steps back is not a jump of the position
         seconds, apart_m = np.abs(time_s[second] - time_s[first]), place_m[second] - place_m[first]
         usual_s = np.maximum(seconds, interval_s)
         flown_m = (usual_mps[np.minimum(first, second)] + _GAIN_MPS2 * usual_s) * usual_s
@@ -195,7 +195,7 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     if not runs.any():
         return none, ""
     for first, end in zip(begins[runs], last[runs], strict=True):
-        none[rows[first + 1 : end + 1]] = True  # keep the first row, because its position is that of the aircraft
+        none[rows[first + 1 : end + 1]] = True  # the position in the first row is right
     longest = int(np.argmax(np.where(runs, lasts_s, 0.0)))
     line, speed_mps = int(frame["line"].iloc[rows[begins[longest]]]), moved_m[longest] / lasts_s[longest]
     return none, (
@@ -205,7 +205,7 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     )
 
 
-# A change of height beyond this and beyond a climb at this speed is not flown [m, m/s].
+# A change of height was not flown if it exceeds the first number [m] and a climb at the second number [m/s].
 _HEIGHT_M, _CLIMB_MPS = 5.0, 10.0
 _SPEEDS = ("velocity_north_mps", "velocity_east_mps")
 
@@ -221,7 +221,7 @@ def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
 
 
 def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArray, float, int]:
-    """Return masks (n,) of rows off the track and of those at rest at an end, and speed and row of the first jump.
+    """Return masks (n,) of rows off the track and of rows at rest at an end, and speed and row of the first jump.
 
     Rows between two fast steps form a run. The longest run that moves is the track. A run that the track cannot reach
     in time is off the track if it is short, or if it does not move and the log begins or ends with it. Any other run
@@ -234,7 +234,7 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArr
         return astray, at_rest, 0.0, 0
     extent_m = np.array([np.ptp(place_m[a:b], axis=0).max() for a, b in zip(begins, ends, strict=True)])
     still = extent_m < _JITTER_M
-    # the longest run is the track: jumps are short, and a log at rest may be longer than the flight
+    # the longest run that moves is the track: jumps are short, but the log may be at rest for longer than the flight
     main = int(np.argmax((ends - begins) * (~still | still.all())))
     few, beyond = max(3.0, 0.05 * count), _out_of_reach(time_s, place_m)
 
@@ -254,7 +254,7 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArr
     step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
     step_s = np.maximum(np.abs(np.diff(time_s)), 1e-3)
     run = int(np.searchsorted(begins, at, side="right")) - 1
-    around = [max(begins[run] - 1, 0), min(ends[run], count - 1) - 1]  # the steps into and out of the first such run
+    around = [max(begins[run] - 1, 0), min(ends[run], count - 1) - 1]  # the steps into and out of the first jump
     return astray, at_rest, float((step_m / step_s)[around].max()), at
 
 
@@ -265,26 +265,26 @@ LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     for flag, ranges in dictionary.LIMITS.items()
 }
 
-# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight receives 30 dBm; the range of a ratio to the
-# noise is wider.
+# Possible levels by unit. Thermal noise in 1 Hz is -174 dBm, and no receiver in flight receives 30 dBm. The range of a
+# ratio to the noise is wider.
 LEVEL_DB = {"dBm": (-200.0, 30.0), "dB": (-200.0, 200.0)}
 
-# Levels re full scale minus the gain: real sounder logs reach 33 dB.
+# Possible levels re full scale minus the gain. Real sounder logs reach 33 dB.
 _LEVEL_OTHER_DB = (-200.0, 100.0)
 
-# A few rows more than a day from all others have a damaged time stamp, because no log pauses for a day.
+# If a few rows are more than a day from all other rows, their time stamps are damaged, because no log pauses for a day.
 _APART_S = 86_400.0
 
 _FEW_SHARE = 0.01
 
 # A computer whose clock has no battery starts in 1970, 1980 or 2000, until GNSS or the network sets the clock. AERPAW
-# began later.
+# began to operate later.
 _CLOCK_SET_NS = int(np.datetime64("2010-01-01", "ns").astype(np.int64))
 
 # "A few" rows are at most this number, or at most a small share of the rows.
 _FEW_ROWS = 3
 
-# Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself.
+# Flags of rows that no comparison scores (``flight/rows.py``). For other flags, the doubtful value is set to NaN.
 UNSCORED = ("level_out_of_range", "level_lost", "time_out_of_range", "rank_above_ports", "no_number",
             "unterminated_line", "marked_invalid")  # fmt: skip
 
@@ -309,19 +309,19 @@ def check(result: ReadResult) -> ReadResult:
 
 # AERPAW's sites, Lake Wheeler and Centennial Campus: latitude, longitude, and the radius of a site, all in degrees.
 SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
-# Report a flight whose median height is this far below the take-off [m]: few take-offs are on such a hill.
+# Report a flight whose median height is this far below the take-off point [m]: few take-offs are on such a hill.
 _BELOW_M = 15.0
-# Highest level that is possible in flight: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
-# SINR do not.
+# Highest possible level in flight, by quantity. Reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6). Reports of
+# RSRQ and SINR have higher values.
 _MOST_DBM = {"RSRP": -20.0}
-# A lost reading is within the first limit of 0 dB, is a placeholder, or repeats the lowest or highest level, and is
-# farther than the second from all other levels. The third is the largest share of lost readings. No path gains 20 dB
-# from one reading to the next and loses it again.
+# A value is a placeholder for a lost level if it is within the first limit of 0 dB, is one of the values below, or
+# repeats the lowest or highest level, and if it is farther than the second limit from all other levels. The third
+# number is the largest share of placeholders. No path gains 20 dB from one level to the next and loses them again.
 _LOST_DB, _FAR_DB, _LOST_SHARE, _CUT_DB = 1.0, 20.0, 0.4, 15.0
-# Lowest values of phones, modems and 8-bit integers, which programs write for a missing reading.
+# Lowest values of phones, modems and 8-bit integers, which programs write for a missing level.
 _LEAST_DB = (-127.0, -128.0, -140.0, -141.0, -150.0, -156.0, -157.0)
-# Levels of two devices alternate from record to record: they differ by more than fading, and return with the next
-# record.
+# Levels of two devices alternate from record to record: they differ by more than fading, and return to the same value
+# with the next record.
 _APART_DB, _BACK_SHARE, _FEW_ALTERNATE, _MOST_TURNS = 10.0, 0.2, 6, 5
 # Levels at one time stamp come from several sources if they differ by more than fading within one second.
 _AT_ONCE_DB = 6.0
@@ -378,8 +378,8 @@ class _Check:
         beyond: dict[str, BoolArray] = {}
         for name in names:
             value, (low, high) = self._values(name), ranges[name]
-            # test the smallest and largest value first, because masks of all columns of a large log take longer than
-            # reading it
+            # test the smallest and largest value first: masks of all columns of a large log would take longer than
+            # reading the log
             least = np.fmin.reduce(value) if len(value) else np.nan
             if not np.isnan(least) and not (low <= least and np.fmax.reduce(value) <= high):
                 beyond[name] = (value < low) | (value > high)
@@ -395,10 +395,10 @@ class _Check:
         self._flag(bad, flag, first, f"where {low:g} .. {high:g} can be{hint}", names)
 
     def _at_a_site_if_otherwise(self) -> None:
-        """Report possible positions that would lie at a site of AERPAW if they were written differently."""
+        """Report possible positions that would be at a site of AERPAW with swapped angles, another sign or unit."""
         if not {*PLACE[:2]} <= set(self.frame.columns):
             return
-        # the median ignores jumps of the receiver
+        # use the median, which is not affected by jumps of the receiver
         place = self.frame[[*PLACE[:2]]].median().to_numpy(dtype=np.float64)
         for how, other in (
             ("latitude and longitude swapped", place[::-1]),
@@ -423,7 +423,7 @@ class _Check:
             self._flag(bad, "rank_above_ports", f"rank {rank[int(np.argmax(bad))]:g}", why, ["rank"])
 
     def _no_index(self) -> None:
-        """Flag levels that mostly cannot be received: an index of the standard (0 .. 127), another unit, or a ratio."""
+        """Flag levels that are mostly too high: an index of the standard (0 .. 127), another unit, or a ratio."""
         level, quantity = self._values("rss_db"), str(self._about.get("quantity"))
         bad = level >= _MOST_DBM.get(quantity, 0.0)
         if 2 * bad.sum() <= np.isfinite(level).sum() or not bad.any():
@@ -442,7 +442,7 @@ class _Check:
             )
 
     def _all_silent(self) -> None:
-        """Report a series without any level, because another unit can put all levels below the floor of the reader."""
+        """Report a series without any level: with a wrong unit, all levels may be below the floor of the reader."""
         heard = np.isfinite(self._values("rss_db")).any()
         silent = 0 if heard else int(self.frame["flag"].str.contains("out_of_coverage").sum())
         if silent and silent == len(self.frame):
@@ -450,7 +450,7 @@ class _Check:
             self._said.append(f"{self._what}: {levels} below the floor of the reader (no signal, or another unit?)")
 
     def _lost_readings(self) -> None:
-        """Flag a few placeholders far from all other levels, which programs write for lost readings."""
+        """Flag a few placeholders far from all other levels, which programs write for lost levels."""
         level = self._values("rss_db")
         # -92 at the end of a file may have become -9, -127 may have become -12
         most = np.where(self.frame["flag"].to_numpy() == UNTERMINATED, _CUT_DB, _LOST_DB)
@@ -477,7 +477,7 @@ class _Check:
             return
         lags = [lag for lag in range(1, _MOST_TURNS + 1) if len(level) >= 3 * lag]
         step, *back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in lags)
-        # the level returns within the next records; after fading it would not return so exactly
+        # two devices: the level returns within the next records, more exactly than after fading
         turns = step > _APART_DB and min(back) < _BACK_SHARE * step
         # in most series few times repeat, and grouping them is slow
         if not turns and 3 * np.count_nonzero(np.diff(np.sort(time, kind="stable"))) > 2 * len(time):
@@ -503,7 +503,7 @@ class _Check:
         step_s = np.maximum(step_s, np.median(step_s * np.diff(begins)))
         rise_m, rows = np.diff(height.to_numpy()[begins]), np.diff(begins)[1:]
         leaps = np.abs(rise_m) / (_HEIGHT_M + _CLIMB_MPS * step_s)
-        # a single row has to leap farther than a value that is written several times
+        # require a larger leap of a single row than of a value that is repeated
         back = (np.minimum(leaps[:-1], leaps[1:]) > np.where(rows > 1, 1, _AROUND)) & (rise_m[:-1] * rise_m[1:] < 0)
         lost = np.zeros(len(time), dtype=np.bool_)
         lost[height.index] = np.repeat([False, *back, False], np.diff(begins, append=len(height)))
@@ -512,7 +512,7 @@ class _Check:
             self._flag(lost, "height_lost", first, "a leap and a return beyond any climb", [PLACE[2]])
 
     def _near_in_time(self) -> None:
-        """Flag a few time stamps that are days from all other time stamps."""
+        """Flag a few time stamps that are more than a day from all other time stamps."""
         # subtract as floats, because int64 would overflow for NaT and for stamps 300 years apart
         time = self.frame["time"].to_numpy("datetime64[ns]")
         stamp: IntArray = time.view(np.int64)

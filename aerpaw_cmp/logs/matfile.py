@@ -1,9 +1,9 @@
 """Numeric and character arrays of MATLAB level-5 files, read so that a damaged file only causes a message.
 
-SciPy's reader is compiled code that trusts the file: a single wrong byte can end the process with a segmentation
-fault. Here every size is checked before it is used. Full numeric arrays and character matrices are read, plain or
-compressed, because merged flights and gain grids consist of them. Variables of other classes are ignored.
-Layout: "MAT-File Format" (MathWorks), chapter 1, level 5.
+SciPy's reader is compiled code that trusts the file: a single wrong byte can end the process with a segmentation fault.
+Here every size is checked before it is used. Full numeric arrays and character matrices, plain or compressed, are read,
+because merged flights and gain grids consist of these. Variables of other classes are ignored. Layout: "MAT-File
+Format" (MathWorks), chapter 1, level 5.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     Raises
     ------
     InputError
-        If it is neither a level-5 nor a version 7.3 file, or a size or type in it is impossible.
+        If the file is neither a level-5 nor a version 7.3 file, or a size or type in the file is impossible.
 
     Notes
     -----
@@ -103,7 +103,7 @@ def names_of(head: bytes) -> list[str]:
         for element in islice(_elements(head, 128, order, padded=False, cut=True), 64):
             body = element.body
             if element.kind == _COMPRESSED:
-                # 256 bytes contain flags, dimensions and a name, after the tag of the matrix
+                # 256 bytes are enough for the tag of the matrix, flags, dimensions and a name
                 body = zlib.decompressobj().decompress(body, 256)[8:]
             names.append(_head_of(_elements(body, 0, order, padded=True, cut=True))[2])
     return names
@@ -138,7 +138,7 @@ def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = Fal
                 raise _damaged("it ends inside a tag")
             return
         kind, size = struct.unpack_from(order + "II", data, at)
-        # in a small element, size and type share the first word, and the bytes are in the second word
+        # in a small element, the first word contains size and type, and the second word the bytes
         if padded and kind >> 16:
             size, kind = kind >> 16, kind & 0xFFFF
             if size > 4:
@@ -155,7 +155,7 @@ def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = Fal
 def _inflated(element: _Element, order: str, most: int) -> _Element:
     machine = zlib.decompressobj()
     try:
-        # 0 would mean that there is no limit
+        # at least 1, because 0 would mean that there is no limit
         plain = machine.decompress(element.body, max(most, 1))
     except zlib.error as error:
         raise _damaged(str(error)) from None
@@ -177,7 +177,7 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
     """Return the name and the array of a variable. The array is None if it is not wanted or of another class."""
     parts = _elements(body, 0, order, padded=True)
     flags, dimensions, title = _head_of(parts)
-    # signed, because a negative size means damage and would wrap to a huge size
+    # read signed sizes: a negative size means damage, and as an unsigned number it would be huge
     shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
     if min(shape) < 0:
         raise _damaged("a negative dimension")
@@ -199,12 +199,12 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
         raise _damaged(f"complex variable {title!r} without imaginary part")
     with np.errstate(all="ignore"):
         array = real.astype(np.complex128)
-        array.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would have a NaN real part
+        array.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf has a NaN real part
     return title, array
 
 
 def _head_of(parts: Iterator[_Element]) -> tuple[bytes, bytes, str]:
-    """Return flags, dimensions and name of a variable, its first three elements."""
+    """Return flags, dimensions and name of a variable, which are its first three elements."""
     head = [*islice(parts, 3)]
     if [element.kind for element in head] != [_UINT32, _INT32, _INT8]:
         raise _damaged("a variable without flags, dimensions or name")
@@ -221,7 +221,7 @@ def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) ->
     count = math.prod(shape)
     if len(values.body) != count * np.dtype(stored).itemsize:
         raise _damaged(f"{len(values.body)} bytes for {count} values")
-    with np.errstate(all="ignore"):  # damaged values may be any number
+    with np.errstate(all="ignore"):  # damaged bytes may be any number
         return np.frombuffer(values.body, dtype=order + stored).astype(kind).reshape(shape, order="F")
 
 

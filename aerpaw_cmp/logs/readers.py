@@ -1,9 +1,10 @@
-"""The reader contract, and the way from a file's bytes to its reader.
+"""The interface of readers, and the search for the reader of a file.
 
 A reader is a pure function of bytes. It opens no file or port. Each format module builds one :class:`Reader` and
 lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` names.
 
-The clock, the height datum and the identity of each stream are written in the file, known from its program, or assumed.
+The clock, the height datum and the identity of each stream are either written in the file, known from its program, or
+assumed.
 
 Attributes ``clock_from``, ``height_from`` (streams with altitudes) and ``identity_from`` (levels and ranks) are one of
 ``written``, ``program``, ``assumed``; ``clock_source`` and ``height_source`` describe the program or the assumption.
@@ -42,24 +43,24 @@ class ReadOptions:
     timezone : str, optional
         IANA zone of clocks without a zone. A reader raises ``UsageError`` if it needs the zone.
     clock : {"local", "utc", "local_as_utc"}, optional
-        Overrides the reader's own rule; ``local_as_utc`` is local wall time stored as if it were UTC.
+        Overrides the reader's own rule; ``local_as_utc`` is local wall time that was stored as if it were UTC.
     time_origin : str, optional
         ISO time (with zone, or local in ``timezone``) of a log whose times are relative.
     gps_rollovers : int
         How often the week number of the log's GPS receiver has rolled over. Each rollover adds 1 024 weeks to the
         times.
     ri_base : {"zero", "one"}, optional
-        Number that the source prints for rank 1. Readers of formats with a fixed base ignore it.
+        Number that the program prints for rank 1. Readers of formats with a fixed base ignore it.
     columns : mapping, optional
         Name of the file column for each record column, only for generic CSV.
     read_elsewhere : collection of str
-        Columns of the same file that the user reads with other options, which need no warning.
+        Columns of the same file that the user reads with other options. They do not need a warning.
     kind : str, optional
-        Generic CSV only.
+        Kind of stream, only for generic CSV.
     node, channel : str, optional
         Tower and channel to which the log belongs.
     frequency_hz : float, optional
-        Carrier.
+        Carrier frequency [Hz].
     unit : {"dBm", "dBFS", "dB"}, optional
         Unit of RSS, if the file does not specify it. ``dBFS`` is stored as ``dB re full scale``; ``dB`` is a ratio.
     floor_db : float
@@ -73,7 +74,7 @@ class ReadOptions:
     Raises
     ------
     UsageError
-        If the unit is not one of these.
+        If ``unit`` has another value.
     """
 
     timezone: str | None = None
@@ -93,7 +94,7 @@ class ReadOptions:
     neighbour: Callable[[str], bytes | None] | None = None
 
     def __post_init__(self) -> None:
-        """Write the unit as logs do, or refuse it."""
+        """Convert the unit to the form in which logs are stored, or refuse it."""
         known = None if self.unit is None else _LEVEL_UNITS.get(self.unit.lower())
         if self.unit is not None and known is None:
             raise UsageError(
@@ -125,19 +126,19 @@ class Reader:
     sample : str
         One typical line.
     sniff : callable
-        ``sniff(head: bytes) -> bool``: content only, never the file name; must not raise.
+        ``sniff(head: bytes) -> bool``. It tests only the content, never the file name, and must not raise an exception.
     read : callable
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
     pieces : bool
         True if a file of a few records is a piece of the log in its folder.
     read_pieces : callable, optional
-        ``read_pieces(pieces, options) -> ReadResult``: the same as ``read``, from pieces of complete lines, for logs
-        larger than memory; see :mod:`aerpaw_cmp.logs.files`.
+        ``read_pieces(pieces, options) -> ReadResult``: the same as ``read``, but from pieces of complete lines, for
+        logs larger than memory; see :mod:`aerpaw_cmp.logs.files`.
     clock_from, height_from : str
         ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.readers`. An attribute
         of this name in a stream has precedence.
     plugin : str
-        Entry point of a third-party reader; set by :func:`catalogue`.
+        Entry point of a third-party reader, set by :func:`catalogue`.
     """
 
     name: str
@@ -155,7 +156,7 @@ class Reader:
 
 @contextmanager
 def blaming(plugin: str, doing: str, kind: type[AerpawCmpError] = UsageError) -> Iterator[None]:
-    """Name the plug-in in errors that its code raises, unless the name is empty, as for readers of this project."""
+    """Name the plug-in in errors that its code raises. An empty name, as for our readers, is not added."""
     try:
         yield
     except Exception as error:
@@ -202,7 +203,7 @@ def _accepts(reader: Reader, head: bytes) -> bool:
 
 
 def by_name(name: str) -> Reader:
-    """Return the reader of a name, or raise ``UsageError`` with the known names."""
+    """Return the reader with a name, or raise ``UsageError`` with the known names."""
     known = {reader.name: reader for reader in catalogue()}
     if name not in known:
         raise unknown_name(f"unknown reader {name!r}", name, sorted(known))
@@ -280,7 +281,8 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 def _way_out(head: bytes) -> str:
     titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
     lines = [decoded(line).strip() for line in titled.split(b"\n")[:20]]
-    # the most frequent sign is the separator, because decimal commas are rarer; titles have fewer separators than names
+    # take the most frequent sign as the separator, because decimal commas are rarer, and titles have fewer separators
+    # than names
     sign = max(",;\t|", key="".join(lines).count)
     first, *below = lines[max(range(len(lines)), key=lambda i: lines[i].count(sign)) :]
     names = [name.strip().strip('"') for name in first.split(sign)]
@@ -301,7 +303,7 @@ _NEGATIVE = re.compile(r'[ "]*-\d{1,3}(\.\d*)?[ "]*')
 
 
 def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return the options that read a table of another kind, if its names or cells allow a track or a level."""
+    """Return the options that read an unknown table, if its names or cells may contain a track or a level."""
     from . import dictionary
 
     elsewhere = next(row.names[0] for row in dictionary.QUANTITIES if row.name == "elsewhere")
@@ -349,7 +351,7 @@ def _origins(stream: Stream, reader: Reader, options: ReadOptions) -> dict[str, 
     if "height_from" not in about and "altitude_m" in stream.frame and stream.frame["altitude_m"].notna().any():
         attributes |= _split("height", reader.height_from)
     if stream.kind in ("rss", "rank") and "identity_from" not in about:
-        # a cell or a connection is an identity as good as a node's name
+        # a cell or a connection identifies a stream as well as the name of a node does
         named = any(key in about for key in ("node", "pci", "rnti")) or options.node is not None
         attributes["identity_from"] = "written" if named else "assumed"
     return attributes
@@ -364,7 +366,7 @@ def _clock(stream: Stream, reader: Reader, options: ReadOptions) -> str:
 
 
 def _split(what: str, text: str) -> dict[str, Attribute]:
-    """Return ``program: datetime.now()`` as two attributes."""
+    """Split a text such as ``program: datetime.now()`` into two attributes."""
     word, _, source = text.partition(": ")
     return {f"{what}_from": word, **({f"{what}_source": source} if source else {})}
 
@@ -374,7 +376,7 @@ def named_tower(path: str, towers: Sequence[str]) -> str | None:
     places = {}
     for tower in towers:
         letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
-        # match complete names: LW12 does not contain LW1, and ACCESS does not contain CC
+        # match complete names: LW12 is not LW1, and ACCESS does not contain the tower CC
         ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
         for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
             places[match.start()] = tower

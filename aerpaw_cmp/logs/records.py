@@ -59,11 +59,11 @@ class Stream:
     Parameters
     ----------
     kind : {"telemetry", "rss", "rank", "kpi"}
-        The kind, which decides the columns (see the module text).
+        Kind of the stream, which determines its columns (see the module text).
     name : str
-        Name that is unique within the file, e.g. ``"vehicle"``, ``"power"``, ``"USRP1"``.
+        Name that is unique within the file, such as ``"vehicle"``, ``"power"`` or ``"USRP1"``.
     frame : pandas.DataFrame
-        The records in file order, default integer index.
+        The records in file order, with the default integer index.
     attributes : mapping
         Attributes of the complete stream: node, channel, unit, frequency_hz, ri_base, clock.
 
@@ -91,7 +91,7 @@ class Stream:
 
     @property
     def channel(self) -> str:
-        """The channel of the receiver if the log has one, else the name."""
+        """The channel of the receiver if the log specifies it, else the name."""
         return str(self.attributes.get("channel") or self.name)
 
 
@@ -106,7 +106,7 @@ class RejectedLine:
 
 @dataclass(frozen=True, slots=True)
 class RejectedReason:
-    """A reason why lines were rejected, with their number and the first and last line (1-based)."""
+    """A reason why lines were rejected, with the number of these lines, and the first and last of them (1-based)."""
 
     reason: str
     count: int
@@ -141,7 +141,7 @@ class ReadResult:
     lines, accepted, blank : int
         ``blank`` counts blank lines, headers and comments.
     rejected : tuple of RejectedLine
-        All other lines, at most the first ``KEPT_REJECTED``.
+        All rejected lines, at most the first ``KEPT_REJECTED``.
     reasons : tuple of RejectedReason
         Number of rejected lines per reason; by default counted from ``rejected``.
     warnings : tuple of str
@@ -163,12 +163,13 @@ class ReadResult:
     reasons: tuple[RejectedReason, ...] = ()
 
     def __post_init__(self) -> None:
-        # readers of small files return only the lines
+        # count the lines, because readers of small files do not return reasons
         if not self.reasons:
             reasons = by_reason(RejectedReason(line.reason, 1, line.number, line.number) for line in self.rejected)
             object.__setattr__(self, "reasons", reasons)
         if len(self.rejected) > KEPT_REJECTED:
-            # the other lines are counted in the reasons: the text of a damaged log of 1 GB would fill the memory
+            # store only the first lines, because the text of a damaged log of 1 GB would fill the memory. All lines are
+            # counted in the reasons.
             object.__setattr__(self, "rejected", self.rejected[:KEPT_REJECTED])
         if self.lines != self.accepted + self.rejected_count + self.blank:
             raise ValueError(
@@ -183,7 +184,7 @@ class ReadResult:
 
 
 def has_wall_clock(start: np.datetime64) -> bool:
-    """Check whether a log has wall-clock times: relative times without an origin count from 1970."""
+    """Check whether a log has wall-clock times. Relative times without an origin begin in 1970."""
     import numpy as np
 
     return bool(start >= np.datetime64("1980-01-01"))

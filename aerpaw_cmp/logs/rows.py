@@ -1,11 +1,12 @@
 """Conversion of lines to records, for all text formats.
 
-:func:`matched` returns the :class:`Rows` of a pattern with named groups, one of them ``time``. :func:`built` does the
-same for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` return columns,
+:func:`matched` returns the :class:`Rows` of a pattern with named groups, one of them ``time``. :func:`built` is the
+equivalent for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` return columns,
 ``Rows.stream`` returns a stream of columns, and ``Rows.result`` completes the account.
 
 :func:`text_reader` makes a reader from a :class:`LineFormat`, which contains the regular expression of the rows, and
-the streams of the columns. It adds sniffing, the account of all lines, times, and truncated last lines.
+the streams of the columns. It adds sniffing, the account of all lines, times, and the treatment of truncated last
+lines.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ Reason = Callable[[bytes], "str | None"]
 
 @dataclass
 class Rows:
-    """Rows of a log that have a time, and the account of all other lines.
+    """The rows of a log that have a time, and the account of all other lines.
 
     Parameters
     ----------
@@ -53,9 +54,9 @@ class Rows:
     relative : bool
         True if the times count from an unknown origin.
     clock_from : str, optional
-        ``written`` if all times have an offset or are epochs.
+        ``written`` if all times have an offset or are Unix times.
     height_from : str, optional
-        The source of the track's heights, if it is known from the table and not from the format alone.
+        Source of the heights of the track, if it follows from the table and not from the format alone.
     about : dict
         Attributes of all streams, such as the device that wrote these rows.
     at : int array, shape (n,)
@@ -111,7 +112,7 @@ class Rows:
         _text.add_flag(self.flag, where, reason)
 
     def part(self, where: BoolArray) -> Rows:
-        """Return the rows of a mask, which share the warnings and the account of all rows."""
+        """Return the rows of a mask. They share the warnings and the account of all rows."""
         columns = {name: cells[where] for name, cells in self.columns.items()}
         return replace(
             self, row=self.row[where], time=self.time[where], flag=self.flag[where], at=self.at[where], columns=columns
@@ -122,7 +123,7 @@ class Rows:
         pick: IntArray | None = None, flag: AnyArray | None = None, about: Mapping[str, Attribute | None] | None = None,
         **attributes: Attribute | None,
     ) -> Stream | None:  # fmt: skip
-        """Return a stream of all rows or of those of a mask, or None if it is empty.
+        """Return a stream of all rows, or of the rows of a mask. None if there are no rows.
 
         Parameters
         ----------
@@ -131,10 +132,10 @@ class Rows:
             Columns of the kind and further columns, each of shape (n,).
         where : bool array, shape (n,), optional
         pick : int array, shape (m,), optional
-            Index of the row of each record, for rows with several records; ``values`` and ``flag`` have shape (m,)
-            then.
+            Index of the row of each record, for rows with several records. ``values`` and ``flag`` then have the shape
+            (m,).
         flag : object array, shape (n,), optional
-            Flags of this stream, instead of those that all streams share.
+            Flags of this stream, instead of the common flags of all streams.
         about : mapping, optional
             Further attributes.
         **attributes
@@ -175,7 +176,7 @@ class Rows:
         names: dict[str, Stream] = {}
         for stream in streams:
             if stream is not None:
-                # names are unique in a file: a console that was started again repeats them
+                # names must be unique in a file, but a console that was started again repeats them
                 alike = sum(name == stream.name or name.startswith(f"{stream.name}_again") for name in names)
                 name = f"{stream.name}_again{alike}" if alike else stream.name
                 names[name] = replace(stream, name=name) if alike else stream
@@ -185,7 +186,7 @@ class Rows:
             reader=self.reader,
             streams=present,
             lines=self.lines,
-            accepted=len(np.unique(self.row)),  # markup may have all its records on a line
+            accepted=len(np.unique(self.row)),  # in markup, all records may be on one line
             blank=self.blank,
             rejected=tuple(sorted(self.rejected, key=lambda line: line.number)),
             warnings=tuple(dict.fromkeys([*self.warnings, *back])),
@@ -233,7 +234,7 @@ def matched(
 
 @dataclass(frozen=True)
 class OtherLines:
-    """The lines of a file that are not rows, as far as its reader knows them.
+    """The lines of a file that are not rows, as far as the reader knows.
 
     Parameters
     ----------
@@ -245,7 +246,7 @@ class OtherLines:
     comments : int array, optional
         0-based lines known to be comments.
     closed : bool
-        True if records have their own end mark, so that a missing line end does not matter.
+        True if records have an end mark, so that a missing line end does not matter.
     """
 
     reason: Reason = field(default=lambda _line: None)
@@ -266,7 +267,7 @@ def built(
     rows : int array, shape (n,)
         0-based lines of the rows.
     column : mapping of str to array, shape (n,)
-        Their cells as bytes or floats.
+        Cells of these rows, as bytes or floats.
     options, reader, skip, clock
         The same as in :func:`matched`.
     others : OtherLines, optional
@@ -307,7 +308,7 @@ def built(
 
 
 def _untimed(lines: _text.Lines, rows: IntArray, cells: AnyArray, valid: BoolArray, clock: str) -> list[RejectedLine]:
-    """Return the lines rejected for their time: an unknown form, not a date of the calendar, or beyond any flight."""
+    """Return the lines rejected for their time: an unknown format, an invalid date, or too long for a flight."""
     bad = np.flatnonzero(~valid & ~np.isin(rows, rows[valid]))
     # reject a line of several records only once
     bad = bad[np.unique(rows[bad], return_index=True)[1]] if len(bad) else bad
@@ -350,13 +351,13 @@ def instants_of(
         return False, instants, valid
     form, unit = clock.split("_")
     unit_ns = _text.COUNTS[unit].ns
-    # tables are parsed to floats already
+    # the cells of tables are already floats
     value = cells if cells.dtype.kind == "f" else np.asarray(_text.numbers(cells), dtype=np.float64)
     origin = _text.origin_ns(options, needed_by=reader) if form == "relative" else 0
     most = _FLIGHT_S if form == "relative" else _MOST_S
     valid = np.isfinite(value) & (np.abs(value) * unit_ns <= most * 1e9)
     safe = np.where(valid, value, 0.0)
-    integer = np.floor(safe)  # convert the fraction separately: a float64 epoch in ns has too few digits
+    integer = np.floor(safe)  # convert the fraction separately: float64 has too few digits for ns
     ns = integer.astype(np.int64) * int(unit_ns)
     ns += np.round((safe - integer) * unit_ns).astype(np.int64) + (origin or 0)
     if form == "epoch" and options.clock in ("local", "local_as_utc"):
@@ -373,7 +374,7 @@ def snr_stream(rows: Rows, tower: str, values: FloatArray, where: BoolArray | No
     rows : Rows
     tower : str
     values : (n,)
-        [dB].
+        SNR [dB].
     where : (n,) bool, optional
         Rows of this tower.
 
@@ -388,7 +389,7 @@ def snr_stream(rows: Rows, tower: str, values: FloatArray, where: BoolArray | No
 
 
 def checked_ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, means: bool = False) -> FloatArray:
-    """Return the ranks of indicators that count from one, NaN for other values, and add reasons to ``flag`` in place.
+    """Return ranks from indicators that count from one. Other values become NaN, with a reason added to ``flag``.
 
     Parameters
     ----------
@@ -398,7 +399,8 @@ def checked_ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = No
     none : bool array, shape (m,), optional
         True where the number means that nothing was reported.
     means : bool
-        True if the program prints means over its period: a value between two ranks is then missing and not an error.
+        True if the program prints means over its report period. A value between two ranks is then a missing rank, not
+        an error.
 
     Returns
     -------
@@ -417,7 +419,7 @@ def checked_ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = No
 def mean_rank(
     rows: Rows, ri: FloatArray, columns: Mapping[str, FloatArray], *, pick: IntArray | None = None
 ) -> list[Stream | None]:
-    """Return the rank streams ``gnb`` of a base station that prints means over its report period, 0 for no report.
+    """Return the rank streams ``gnb`` of a base station that prints means over its report period (0 if no report).
 
     A mean between two ranks is not a rank: it is in ``rank_mean``, and its row is flagged ``rank_is_a_mean``.
 
@@ -447,7 +449,7 @@ def of_ues(
     rows: Rows, kind: Kind, name: str, values: Mapping[str, FloatArray], *, pick: IntArray | None = None,
     flag: AnyArray, about: Mapping[str, Attribute | None],
 ) -> list[Stream | None]:  # fmt: skip
-    """Return a stream per UE (RNTI, cell) if several were attached at once, else one stream for all RNTIs.
+    """Return a stream per UE (RNTI, cell) if several were attached at the same time, else one stream for all RNTIs.
 
     A UE that attaches again gets a new RNTI.
 
@@ -455,7 +457,8 @@ def of_ues(
     ----------
     rows : Rows
     kind, name : str
-        Kind and name. Names of several streams end in ``_rnti<hex>``, and in ``_pci<n>`` for one RNTI in several cells.
+        Kind and name. If there are several streams, ``_rnti<hex>`` is appended to the name, or ``_pci<n>`` for one RNTI
+        in several cells.
     values : mapping
         Columns of shape (m,), one of them ``rnti`` (NaN if unknown).
     pick : int array, shape (m,), optional
@@ -474,7 +477,7 @@ def of_ues(
         (ue, mine, {"identity_from": "assumed"} if number is None else {"rnti": int(number)})
         for ue, mine, number in _divided(name, np.ones(len(rnti), dtype=bool), rnti, "rnti{:04x}")
     ]
-    if "pci" in values:  # two cells may assign the same RNTI at one time
+    if "pci" in values:  # two cells may assign the same RNTI at the same time
         parts = [
             (cell, within, {**more, "pci": int(number)} if cell != ue and number is not None else more)
             for ue, mine, more in parts
@@ -501,11 +504,11 @@ def _divided(name: str, where: BoolArray, column: FloatArray, label: str) -> lis
 
 
 def _identity(numbers: FloatArray, most: int) -> FloatArray:
-    """Return the numbers that can be an identity, and NaN for others, such as fractions."""
+    """Return the numbers that can be an identity. Other numbers, such as fractions, become NaN."""
     return np.where((numbers >= 0) & (numbers <= most) & (numbers == np.round(numbers)), numbers, np.nan)
 
 
-# RNTIs have sixteen bits; programs print up to six hex digits.
+# RNTIs have sixteen bits, but programs print up to six hex digits.
 _MOST_RNTI, _MOST_PCI = 0xFFFFFF, 1007
 
 
@@ -530,16 +533,16 @@ class LineFormat:
         header.
     header : re.Pattern, optional
         The complete line above a table, which is a comment at any position. A file is recognised by this line or by
-        ``mark``, if there is one, else by most of its first lines being rows.
+        ``mark``. Without both, it is recognised if most of its first lines are rows.
     mark : re.Pattern, optional
-        MULTILINE; a line by which a console is recognised.
+        A line by which a console is recognised, as a MULTILINE pattern.
     torn : re.Pattern, optional
         The beginning of a row of a console. A line that begins in this way but is not a row is rejected, and all other
         lines are comments. If it is None, every line that is neither a row nor the header is rejected.
     otherwise : str
         Reason of rejected lines.
     fields : int
-        Number of fields of a table; lines with another number are rejected.
+        Number of fields of a table. Lines with another number of fields are rejected.
     clock : str
         See :func:`aerpaw_cmp.logs.rows.instants_of`.
     skip : callable, optional
@@ -564,14 +567,15 @@ class LineFormat:
     def sniff(self, head: bytes) -> bool:
         """Check whether the beginning of a file has this format."""
         if self.mark is not None:
-            # an expression that is anchored to line starts takes 5 ms per MiB, and sniffers see 4 MiB of a KML
+            # exclude markup first: an expression anchored to line starts takes 5 ms per MiB, and sniffers see 4 MiB of
+            # a KML
             return not head.startswith(_text.MARKUP) and self.mark.search(head) is not None
         if self.header is not None:
             return self.header.fullmatch(head[:4000].split(b"\n", 1)[0]) is not None
         return _text.mostly(head, self.row) if isinstance(self.row, re.Pattern) else False
 
     def _reason(self, line: bytes) -> str | None:
-        """Return why a line that is not a row is rejected, or None for a comment."""
+        """Return the reason why a line that is not a row is rejected, or None for a comment."""
         if self.header is not None and self.header.fullmatch(line):
             return None
         if self.torn is not None:
@@ -587,7 +591,7 @@ def text_reader(
     streams: Callable[[Rows], Iterable[Stream | None]], clock_from: str = ASSUMED_CLOCK,
     height_from: str = ASSUMED_HEIGHT,
 ) -> Reader:  # fmt: skip
-    """Return a reader of lines that a pattern describes.
+    """Return a reader for a format whose lines are described by a pattern.
 
     Parameters
     ----------

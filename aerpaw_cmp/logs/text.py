@@ -3,8 +3,8 @@
 Lines are byte ranges of a file, without a Python object per line. A line ends with LF, and a CR before it belongs to
 the line end. Text after the last LF is also a line. A file that ends with LF has no additional empty line.
 
-Wall clocks of all readers become UTC here. Almost all AERPAW nodes write naive America/New_York time, and some
-authors stored that wall clock as if it were UTC.
+Wall clocks of all readers become UTC here. Almost all AERPAW nodes write naive America/New_York time. Some authors
+stored that wall clock as if it were UTC.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ TEXT_LIMIT = 500
 # Flag of a record in a last line without line end: its last field may be cut short.
 UNTERMINATED = "unterminated_line"
 
-# Why a line with NUL bytes is rejected.
+# Reason for rejecting a line with NUL bytes.
 NUL = "NUL bytes in the line (the file system was not synced when the power failed)"
 
-# First bytes of markup files, which are not consoles or tables.
+# First bytes of markup files, which are neither consoles nor tables.
 MARKUP = (b"<?xml", b"<kml", b"<gpx")
 
-# A decimal number of bounded length (bytes pattern, no group), as the parser of pandas accepts, see ``_table``.
+# A decimal number of bounded length (bytes pattern, no group), as accepted by the parser of pandas.
 NUMBER = rb"[-+]?\d{1,400}(?:\.\d{0,400})?(?:[eE][-+]?\d{1,400})?"
 
 
@@ -70,7 +70,7 @@ class Lines:
     def blank(self) -> BoolArray:
         """The mask of lines that contain only white space."""
         empty = self.ends <= self.starts
-        # few lines begin and end with white space, and only those are tested one by one
+        # test only the few lines that begin and end with white space one by one
         some = np.flatnonzero(~empty)
         ends = self.buffer[[self.starts[some], self.ends[some] - 1]]
         for i in some[np.isin(ends, [*b" \t\r\v\f"]).all(axis=0)].tolist():
@@ -118,7 +118,7 @@ _SLICE = 1 << 17
 def _places(buffer: AnyArray, byte: int) -> IntArray:
     """Return the offsets of a byte, shape (n,)."""
     starts = range(0, len(buffer), _SLICE)
-    # slice by slice, because a mask is as large as the buffer
+    # search slice by slice, because a mask would be as large as the buffer
     parts = [np.flatnonzero(buffer[first : first + _SLICE] == byte) + first for first in starts]
     return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
@@ -148,7 +148,7 @@ def split(data: bytes) -> Lines:
 
 
 def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
-    r"""Return the lines that the pattern describes, and its groups.
+    r"""Return the lines that match a pattern, and the groups of the pattern.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
     groups : list of tuple of bytes, length n
         One tuple per line.
     """
-    if b"\r\r" in lines.data:  # the pattern allows one carriage return, and raw() already removes one
+    if b"\r\r" in lines.data:  # the pattern allows one carriage return, and raw() removes another one
         tried = ((i, pattern.match(lines.raw(i))) for i in range(len(lines)))
         hits = [(int(lines.starts[i]), hit.groups(b"")) for i, hit in tried if hit is not None]
     else:
@@ -171,7 +171,7 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
 
 
 class Rejects:
-    """The rejected lines of a log that is read in pieces: the first ones verbatim, and the number per reason."""
+    """The rejected lines of a log that is read in pieces: the first lines verbatim, and the count per reason."""
 
     def __init__(self) -> None:
         self.before = 0  # number of lines in earlier pieces
@@ -179,10 +179,10 @@ class Rejects:
         self._reasons: list[RejectedReason] = []
 
     def add(self, lines: Lines, numbers: Sequence[int] | IntArray, reason: str) -> None:
-        """Add lines (0-based) of a piece for one reason, and store the first ones of each piece."""
+        """Add lines (0-based) of a piece for one reason, and store the first lines of each piece."""
         if not len(numbers):
             return
-        # numbers count from the first piece of the file
+        # count line numbers from the beginning of the file
         low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
         self._reasons.append(RejectedReason(reason, len(numbers), low, high))
         # store more lines than are kept, because the reasons of one piece are not added in the order of the file
@@ -253,7 +253,7 @@ def numbers(column: AnyArray) -> AnyArray:
     """Convert numbers from text to float64, with NaN for empty text."""
     if column.dtype.itemsize == 0 or len(column) == 0:
         return np.full(len(column), np.nan)
-    # Python programs print None for an unknown value
+    # None is NaN, too: Python programs print it for an unknown value
     return np.asarray(np.where((column == b"") | (column == b"None"), b"nan", column).astype(np.float64))
 
 
@@ -283,7 +283,7 @@ def first_lines(head: bytes) -> list[bytes]:
 
 
 def mostly(head: bytes, pattern: re.Pattern[bytes]) -> bool:
-    """Check whether the pattern describes more than half of the first lines."""
+    """Check whether more than half of the first lines match the pattern."""
     lines = first_lines(head)
     return bool(lines) and 2 * sum(pattern.match(line) is not None for line in lines) > len(lines)
 
@@ -297,7 +297,7 @@ ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
 
 class Count(NamedTuple):
-    """A unit of time: its name, nanoseconds, pattern in column names, and the smallest count that is an epoch."""
+    """A unit of time: its name, nanoseconds, pattern in column names, and the smallest count that is a Unix time."""
 
     name: str
     ns: float
@@ -305,7 +305,8 @@ class Count(NamedTuple):
     least_epoch: float
 
 
-# In the order in which a name is searched. 1e9 microseconds are a quarter of an hour of PX4's own clock, not an epoch.
+# Units in the order in which they are searched for in a name. A count of 1e9 microseconds is not a Unix time: it is a
+# quarter of an hour of PX4's own clock.
 COUNTS = {
     "ns": Count("nanoseconds", 1.0, re.compile(r"\bn(s|sec|anos\w*)\b"), 1e18),
     "us": Count("microseconds", 1e3, re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"), 1e15),
@@ -320,12 +321,12 @@ _BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour
 
 @dataclass(frozen=True)
 class Instants:
-    """UTC times, and which of them are doubtful.
+    """UTC times, with masks of the doubtful times.
 
     Parameters
     ----------
     time : datetime64[ns] array, shape (n,)
-        UTC, naive.
+        Times in UTC, naive.
     ambiguous, nonexistent : bool array, shape (n,)
         True for a wall clock that occurs twice, or never, because of a change between winter and summer time.
     warnings : tuple of str
@@ -354,7 +355,7 @@ def zone(name: str | None, *, needed_by: str) -> tzinfo:
             expected="the key 'timezone:' or --timezone, e.g. America/New_York",
             cause="the log writes local wall time without an offset",
         )
-    if name.upper() == "UTC":  # needs no zone database
+    if name.upper() == "UTC":  # available without a zone database
         return timezone.utc
     try:
         return ZoneInfo(name)
@@ -376,7 +377,7 @@ def _offset_s(wall_s: int, where: tzinfo, fold: int) -> int:
         offset = moment.replace(tzinfo=where, fold=fold).utcoffset()
     except (OverflowError, ValueError):
         return 0
-    # some zones had seconds before 1900
+    # round, because before 1900 offsets of some zones had fractions of a minute
     return 0 if offset is None else round(offset.total_seconds())
 
 
@@ -388,8 +389,8 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     """Convert the wall clock of a zone to UTC.
 
     A wall clock that occurs twice is read as daylight time until the log's clock steps back by half an hour or more,
-    and as winter time afterwards. A wall clock that never occurs is read with the offset before the change. Both are
-    flagged.
+    and as winter time afterwards. A wall clock that never occurs is read with the offset before the change. Times of
+    both kinds are flagged.
 
     Parameters
     ----------
@@ -398,12 +399,12 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     name : str or None
         IANA zone.
     needed_by : str
-        Name of the clock's owner for the message.
+        Name of the log or option that needs the zone, for the message.
 
     Raises
     ------
     UsageError
-        If the zone is missing or unknown, or is a winter time and the times are in summer.
+        If the zone is missing or unknown, or is a winter time although the times are in summer.
     """
     where = zone(name, needed_by=needed_by)
     starts, buckets, index = _runs(wall_ns)
@@ -424,7 +425,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
         back = np.flatnonzero(np.diff(wall_ns // 1_000_000_000) <= -1800)
         behind = ambiguous.copy()
         behind[: back[0] + 1 if len(back) else None] = False
-        # the second occurrence of the hour is later by the change of the clock
+        # the second occurrence of the hour is later, by the change of the clock
         utc[behind] += np.repeat((first - second)[index], length)[behind] * 1_000_000_000
         warnings.append(
             f"{counted(int(ambiguous.sum()), 'time')} in the hour that occurs twice in {name}: read as daylight time "
@@ -437,7 +438,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
 
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the starts of runs within a quarter of an hour, the distinct quarters, and the quarter of each run."""
+    """Return the starts of runs of times in a quarter of an hour, the distinct quarters, and that of each run."""
     # look up the zone once per quarter of an hour
     bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
     starts = np.flatnonzero(np.diff(bucket, prepend=bucket[:1] - 1))
@@ -464,9 +465,9 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     Returns
     -------
     wall_ns : int array, shape (n,)
-        Zero where invalid.
+        Wall clock [ns], zero if invalid.
     valid : bool array, shape (n,)
-        True for a date of the calendar and a time of day.
+        True for a valid date and time of day.
     """
     # Times increase, so parse each date and minute once per run of equal values. Sixteen characters are compared as two
     # integers per row.
@@ -492,7 +493,7 @@ def integers(cells: AnyArray, base: int = 10) -> tuple[IntArray, AnyArray]:
     """Return digits, uint8 of shape (n, m), as integers, and the largest digit, above 9 if one is not a digit."""
     total, worst = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=np.uint8)
     for column in cells.T:
-        # other characters wrap to more than 9
+        # other characters wrap around to values above 9
         digit = column - np.uint8(48)
         np.maximum(worst, digit, out=worst)
         total *= base
@@ -570,7 +571,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
     -------
     instants : Instants
     valid : bool array, shape (n,)
-        False for invalid times, which are 1970-01-01 in ``instants``.
+        False for invalid times, which are stored as 1970-01-01 in ``instants``.
     """
     wall, valid, offset, zoned = parse_texts(column)
     naive = valid & ~zoned
@@ -583,7 +584,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
     zones = np.unique(offset[zoned & valid])
     alike = (wall[naive] - zones[0] * 1_000_000_000).astype("datetime64[ns]") if len(zones) == 1 else None
     if alike is not None and _are_near(alike, utc[zoned & valid]):
-        # one program wrote all rows, so times without a zone have the zone of the other times
+        # all rows were written by one program, so times without a zone have the zone of the other times
         where = f"UTC {zones[0] / 3600:+g} h"
         text = f"{counted(int(naive.sum()), 'time')} without a zone between times at {where}: read with the same zone"
         utc[naive] = alike
@@ -594,7 +595,7 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
 
 
 def _are_near(times: AnyArray, others: AnyArray) -> bool:
-    """Check whether most times are within a quarter of an hour of one of the other times."""
+    """Check whether most times are within a quarter of an hour of a time in ``others``."""
     ordered = np.sort(others)
     at = np.searchsorted(ordered, times)
     apart = [np.abs(times - ordered[place.clip(0, len(ordered) - 1)]) for place in (at - 1, at)]
@@ -623,7 +624,7 @@ def frame(
 ) -> pd.DataFrame:
     """Return the frame of a kind, with NaN in columns that the log does not have (``fix``, ``satellites``: -1).
 
-    Its columns are copies, because streams of one log share their times.
+    The columns are copies, because streams of one log share their times.
 
     Parameters
     ----------
@@ -637,7 +638,7 @@ def frame(
     values : mapping of str to (n,)
         Columns of the kind that the log has.
     own : bool
-        True if the arrays can be used without copies, as for a log of 1 GB.
+        True if the arrays may be used without copies, to save memory for a log of 1 GB.
 
     Returns
     -------
@@ -654,7 +655,7 @@ def frame(
     for name in COLUMNS[kind]:
         dtype, missing = (np.int64, -1) if name in _INTEGERS else (np.float64, np.nan)
         content[name] = array(values[name], dtype=dtype) if name in values else np.full(count, missing)
-    # copy the other arrays, because several streams may use them
+    # copy all other arrays, because several streams may use them
     content |= {name: np.array(column) for name, column in values.items() if name not in content}
     columns: pd.DataFrame = pd.DataFrame(content, copy=False)
     return columns
@@ -670,8 +671,8 @@ def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Att
 
 
 def back_in_time(records: pd.DataFrame) -> list[str]:
-    """Return a warning if the clock of a log runs backwards anywhere."""
+    """Return a warning if the clock of a log steps back anywhere."""
     time = records["time"].to_numpy()
-    # NaT compares as False
+    # comparisons with NaT are False
     places = int(np.count_nonzero(time[1:] < time[:-1]))
     return [f"time steps back at {counted(places, 'place')}"] if places else []

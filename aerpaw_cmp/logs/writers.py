@@ -1,7 +1,7 @@
-"""Conversion of records to the bytes of real AERPAW log formats, for ``simulate``: the inverse of the readers.
+"""Conversion of records to the bytes of real AERPAW log formats for ``simulate``. It is the inverse of the readers.
 
 All functions are pure functions of arrays and do not open files. Layouts are exactly those of the tools that write the
-real logs: CR LF line ends where Python's ``csv`` wrote them, octal offsets and ``*`` runs where ``od`` did.
+real logs: CR LF line ends from Python's ``csv``, octal offsets and ``*`` runs from ``od``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     timezone : str
         IANA zone of the simulated clock.
     digits : int
-        Number of digits of the fraction, 1 to 6. Further digits are cut off, as by ``strftime``.
+        Number of digits of the fraction, 1 to 6. Further digits are truncated, as in ``strftime``.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
     Parameters
     ----------
     frame : pandas.DataFrame
-        Telemetry records. A row without a position is written as the logger does: -999 and fix 0.
+        Telemetry records. A row without a position is written with -999 and fix 0, as the logger does.
     timezone : str
         Zone of the vehicle's clock.
     """
@@ -73,7 +73,7 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
     # add 0.0, because -0.0 would be written with its sign
     speed = frame[["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]].fillna(0.0).to_numpy() + 0.0
     fix = np.where(nowhere, 0, np.where(frame["fix"] < 0, 3, frame["fix"]))
-    # -1 is the record's "unknown": the logger always writes a number
+    # replace -1 ("unknown" in a record), because the logger always writes a number
     satellites = np.where(frame["satellites"] < 0, 12, frame["satellites"])
     columns = [column.tolist() for column in (longitude, latitude, altitude, angles, speed, fix, satellites)]
     stamps = local_text(frame["time"].to_numpy(), timezone)
@@ -119,7 +119,7 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> byte
     would be lost.
     """
     level = unmasked(rss_db)
-    # float32 as in the sounder, so that equal samples have equal digits
+    # use float32 like the sounder, so that equal samples have equal digits
     level = np.where(np.isnan(level), _FLT_MIN_DB - _RX_GAIN_DB, level).astype(np.float32)
     stamps = local_text(times, timezone)
     same = np.concatenate(([False], level[1:] == level[:-1])) if len(level) else np.zeros(0, dtype=bool)

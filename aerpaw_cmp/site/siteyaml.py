@@ -323,13 +323,26 @@ def load_site(name_or_path: str | Path, *, coordinates: str | None = None, tower
     path, model, line_of = _find(name_or_path)
     changes: dict[str, Any] = {"coordinates": coordinates, "tower_ground": tower_ground}
     model = model.model_copy(update={key: value for key, value in changes.items() if value is not None})
+    key = model.model_dump_json()
+    if key in _BUILT:
+        return _BUILT[key]
     try:
-        return build_site(model, Path(path).parent)
+        site = build_site(model, Path(path).parent)
     except UsageError as error:
         if error.path is not None:
             raise
         line = line_of(error.location) if isinstance(error, _PlacedError) else None
         raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path, line=line) from None
+    if model.dem is None and model.scene is None:  # other files can change
+        _BUILT[key] = site
+        for old in list(_BUILT)[:-_MOST_BUILT]:
+            del _BUILT[old]
+    return site
+
+
+# The last sites by their settings: one report, and each task of a campaign, requests a site several times.
+_BUILT: dict[str, Site] = {}
+_MOST_BUILT = 4
 
 
 class _PlacedError(UsageError):

@@ -223,14 +223,16 @@ def foliage_depth_m(
     return depth
 
 
-_last_index: list[CrownIndex] = []
+_last_indices: list[CrownIndex] = []
 
 
 def crown_index(trees: Trees) -> CrownIndex:
-    """Return the spatial index of the cones of these trees. The last index is cached for repeated calls."""
-    if not _last_index or _last_index[0].trees is not trees:
-        _last_index[:] = [CrownIndex(trees)]
-    return _last_index[0]
+    """Return the spatial index of the cones of these trees. The last two are cached: a site has two kinds of ground."""
+    index = next((index for index in _last_indices if index.trees is trees), None)
+    if index is None:
+        index = CrownIndex(trees)
+        _last_indices[:] = [index, *_last_indices[:1]]
+    return index
 
 
 class CrownIndex:

@@ -1,1 +1,1 @@
-"""The live tap of a modem: framing, commands, durable log."""
+"""The live tap of a modem: commands, parsing of answers, and the durable log."""

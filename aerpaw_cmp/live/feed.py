@@ -1,8 +1,8 @@
 """The state that the tap's page shows: rows of measurements and predictions, the state of each modem, alarms.
 
-The tap passes records to :meth:`Feed.put`, which appends to a bounded queue and returns without a lock that a browser
-could hold. A thread of the server processes the queue. Each browser requests what is newer than its cursor. Rows are
-stored in rings of fixed size, so memory does not grow with the flight or with browsers that do not read.
+The tap passes records to :meth:`Feed.put`, which appends to a bounded queue. It does not use a lock that a browser
+could hold. A thread of the server processes the queue. Each browser requests the data that are newer than its cursor.
+Rows are stored in rings of fixed size, so memory does not grow with the flight or with browsers that do not read.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ _GPS_LOST_S = 5.0
 _CLOCK_OFF_S = 2.0
 _DISK_LOW_BYTES = 200 * 2**20
 _STEP_SHOWN_S = 30.0
-# Shorter steps are in the log only: they move a sample by less than the error of its position.
+# Smallest step of the clock that the page shows [s]. A smaller step moves a sample by less than the error of its
+# position.
 _STEP_S = 0.2
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
-# Errors that a record of unexpected content can raise. Such a record is not shown on the page, and polls do not wait
-# for it.
+# Errors that a record with unexpected content can raise. The record is then not shown on the page, and the polling
+# continues.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
-# a version, then two row numbers for each of at most sixteen modems
+# A cursor: a version, then two row numbers for each of at most sixteen modems.
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 
@@ -60,8 +61,8 @@ class Rows:
         self.count += 1
 
     def after(self, first: int, most: int = CHUNK) -> tuple[int, str]:
-        """Return the number of the first row, and the rows from there on as little-endian floats in base64."""
-        # rows before the oldest are lost; a cursor beyond the end is invalid and gets no rows
+        """Return the number of the first returned row, and the rows from it on as little-endian floats in base64."""
+        # older rows are lost; a cursor beyond the end is invalid and gets no rows
         oldest = self.count - len(self._rows)
         first = min(max(first, oldest), self.count)
         part = itertools.islice(self._rows, first - oldest, first - oldest + most)
@@ -70,7 +71,7 @@ class Rows:
 
 @dataclass(slots=True)
 class Alarm:
-    """An alarm and its time. ``end_s`` is None while it is active."""
+    """An alarm and its time. ``end_s`` is None while the alarm is active."""
 
     number: int
     modem: int
@@ -112,12 +113,12 @@ class _Modem:
     sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=64))
     open: dict[str, Alarm] = field(default_factory=dict)
 
-    # the status has the first four, too, but a record may be later
+    # the status also contains the first four, but a record may be newer
     _SHOWN = ("connected", "rank", "rsrp_dbm", "sinr_db", "name", "port", "predicts", "offset_db", "inside", "ended")
 
     @property
     def stale_s(self) -> float:
-        """Age from which a measured value is not the present one [s]."""
+        """Age from which a measured value is out of date [s]."""
         return stale_after_s(self.period_s)
 
     def shown(self, now: float) -> dict[str, Any]:
@@ -156,7 +157,7 @@ class Feed:
         self._ended: Mapping[str, Any] | None = None
 
     def put(self, modem: int, item: Record | TapStatus) -> None:
-        """Add a record or a status, without blocking. The oldest item is dropped if too many wait."""
+        """Add a record or a status, without blocking. If too many items wait, the oldest is dropped."""
         self._pending.append((modem, item))
 
     def end(self, ended: Mapping[str, Any]) -> None:
@@ -183,7 +184,7 @@ class Feed:
                 self._bump()
 
     def after(self, cursor: str, wait_s: float = 0.0) -> tuple[dict[str, Any] | None, str]:
-        """Return everything newer than the cursor, and the next cursor. None if nothing came within the time.
+        """Return everything newer than the cursor, and the next cursor. None if nothing new came within ``wait_s``.
 
         A cursor of another session, or an invalid cursor, starts from the beginning.
         """
@@ -211,7 +212,7 @@ class Feed:
                 "alarms": [asdict(alarm) for alarm in self._alarms if alarm.version > version],
                 "ended": self._ended,
             }
-            # if rows remain, keep the old version, so that the next request does not wait
+            # if rows remain to be sent, keep the old version, so that the next request does not wait
             reached_version = self._version if complete else version
             return message, "-".join(map(str, [self.epoch, reached_version, *following]))
 
@@ -291,7 +292,7 @@ class Feed:
         low, high = record.get("rank_interval") or (None, None)
         level_low, level_high = record.get("level_interval_dbm") or (None, None)
         level, offset = record.get("level_dbm"), modem.offset_db
-        # without an offset, the replayed level is not in the units of the RSRP axis
+        # without an offset, the replayed level does not have the reference of the RSRP axis
         level = None if level is None or offset is None else level + offset
         modem.predicted.add(
             (
@@ -311,7 +312,7 @@ class Feed:
 
     def _take_clock(self, modem: _Modem, record: Record) -> None:
         step_s = record["step_ns"] / 1e9
-        if abs(step_s) >= max(_STEP_S, modem.period_s / 2):  # samples of a slow tap are farther apart
+        if abs(step_s) >= max(_STEP_S, modem.period_s / 2):  # for a slow tap, only larger steps matter
             modem.step_s = self._seconds(record["mono_ns"])
             modem.step_text = f"the wall clock stepped by {step_s:+.3f} s"
 
@@ -328,7 +329,7 @@ class Feed:
             kind=kind,
             text=text[:_LONGEST_TEXT],
             start_s=self.now(),
-            version=self._version + 1,  # the present version may have been sent
+            version=self._version + 1,  # the present version may already have been sent
         )
         self._alarm_count += 1
         self._alarms.append(alarm)
@@ -379,7 +380,7 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
         alarms["disk"] = f"less than {_DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
     if modem.step_s is not None and now - modem.step_s < _STEP_SHOWN_S:
         alarms["step"] = modem.step_text
-    # a line may be written late but never early, so the limit for early lines is smaller
+    # a line may be written late but never before its time, so the limit for early lines is smaller
     if modem.delay_s is not None and (modem.delay_s < -_CLOCK_OFF_S / 4 or modem.delay_s > _CLOCK_OFF_S):
         ahead = "ahead of" if modem.delay_s < 0 else "behind"
         alarms["clock"] = f"the telemetry's clock is {abs(modem.delay_s):.1f} s {ahead} this computer's"

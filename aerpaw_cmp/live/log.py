@@ -1,8 +1,8 @@
 """The tap's durable log: append-only JSONL segments.
 
 One record is one line, written by one ``write`` to an ``O_APPEND`` file, so a record that was written before a SIGKILL
-is in the file. ``fdatasync`` follows at an interval, so a power loss costs at most that interval. Each line ends with
-the CRC-32 of the preceding text, which distinguishes records from truncated or damaged lines.
+is in the file. ``fdatasync`` is called at an interval, so a power loss destroys at most the records of one interval.
+Each line ends with the CRC-32 of the preceding text, which distinguishes records from truncated or damaged lines.
 
 A thread writes the records (:class:`TapLog`). The polling waits at most ``patience_s`` for each record, so a record is
 normally in the kernel before the next command is sent.
@@ -33,7 +33,7 @@ from ..logs.files import Record, encode_record
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """The wall and monotonic clock [ns]. Tests use other clocks."""
+    """The wall clock and the monotonic clock [ns]. Tests use simulated clocks."""
 
     utc_ns: Callable[[], int] = time.time_ns
     mono_ns: Callable[[], int] = time.monotonic_ns
@@ -66,15 +66,16 @@ class LogSettings:
     sync_interval_s : float
         Longest time between a record and its ``fdatasync``. 0: after every record.
     segment_bytes : int
-        A segment is closed at this size.
+        Size at which a segment is closed.
     segment_s : float
-        A segment is closed at this age [s].
+        Age at which a segment is closed [s].
     backlog_records, backlog_bytes : int
         Limits of the records that wait in memory while the disk does not accept them.
     retry_s : float
-        Pause between attempts on a faulty disk.
+        Pause between attempts to write to a faulty disk [s].
     patience_s : float
-        Longest wait of the polling for a record to be written. Then the polling continues and records wait in memory.
+        Longest time that the polling waits for a record to be written [s]. After that, the polling continues, and
+        records wait in memory.
     """
 
     sync_interval_s: float = 1.0
@@ -107,7 +108,7 @@ class TapLog:
     fault : str
         Reason why the disk cannot be written now. Empty if the disk can be written.
     free_bytes : int or None
-        Space left on the disk for an ordinary user.
+        Free space on the disk for an ordinary user.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class TapLog:
         self._queue: deque[tuple[Record, int]] = deque()
         self._queued_bytes = 0
         self._busy = self._closing = self._sync_wanted = False
-        # one counter for each of the two threads, so that neither loses a count of the other
+        # use a counter for each of the two threads: with a common counter, counts could be lost
         self._dropped = self._refused = 0
         self._fault_since_ns = self._fault_lost = self._retry_ns = 0
         self._stem, self._fd, self._size, self._torn, self._dirty = "", -1, 0, False, False
@@ -165,7 +166,7 @@ class TapLog:
         self._thread.start()
 
     def append(self, record: Record) -> bool:
-        """Pass one record to the thread. Return True once the kernel has it, False if it waits in memory."""
+        """Pass one record to the thread. Return True if the kernel has it, False if the record waits in memory."""
         # approximate size of the other fields of a record as text
         size = 500 + sum(len(line) for line in record.get("lines", ()) if isinstance(line, str))
         with self._changed:
@@ -177,7 +178,7 @@ class TapLog:
                 self._queued_bytes -= self._queue.popleft()[1]
                 self._dropped += 1
             self._changed.notify_all()
-            # wait only once during a stall of the disk
+            # during a stall of the disk, only the first record waits
             if not stalled:
                 self._changed.wait_for(lambda: self._is_idle() or bool(self.fault), limits.patience_s)
             return self._is_idle() and not self.fault
@@ -195,7 +196,7 @@ class TapLog:
         return [self._messages.popleft() for _ in range(len(self._messages))]
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Write the waiting records and close. A disk that still hangs after the time is abandoned."""
+        """Write the waiting records and close. Do not wait longer than ``timeout_s`` for a disk that hangs."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -227,7 +228,7 @@ class TapLog:
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-            # the polling continues, because the kernel has the record
+            # after the kernel has the record, the polling continues; sync meanwhile
             if self._dirty and self._clock.mono_ns() - self._synced_ns >= self._settings.sync_interval_s * 1e9:
                 self._sync()
             self._measure_disk()
@@ -252,7 +253,7 @@ class TapLog:
                 self._queue.appendleft((record, size))
                 self._queued_bytes += size
             return False
-        except Exception as error:  # one bad record must not end the log
+        except Exception as error:  # an error in one record must not end the log
             self._refused += 1
             self._messages.append(f"a record could not be written: {type(error).__name__}: {error}")
         try:
@@ -269,7 +270,7 @@ class TapLog:
         """Write a record as one line. Its number also counts lost records, so that readers notice the loss."""
         record["n"] = self.records + self.lost
         line = encode_record(record)
-        # if a truncated line could not be removed, end it, so that its checksum refuses only that line
+        # if a truncated line could not be removed, end it here, so that the checksum refuses only that line
         data = b"\n" + line if self._torn else line
         written = os.write(self._fd, data)
         # if the disk became full within the line, remove the truncated line from the file
@@ -289,7 +290,7 @@ class TapLog:
     def _fail(self, error: OSError) -> None:
         """Record that the disk failed, and set the time of the next attempt."""
         if error.errno in (errno.EIO, errno.EROFS, errno.EBADF, errno.ESTALE):
-            self._close_fd()  # after a failed sync the kernel may have dropped pages: go on in a new segment
+            self._close_fd()  # a failed sync may have dropped pages: use a new segment
         self._retry_ns = self._clock.mono_ns() + int(self._settings.retry_s * 1e9)
         if not self.fault:
             self.fault = error.strerror or str(error)
@@ -321,7 +322,7 @@ class TapLog:
         try:
             self._put({**self._header(), "segment": len(self.paths) + 1})
             os.fdatasync(self._fd)
-            # the name of a new file survives a power loss only once its folder is synced
+            # sync the folder: otherwise the name of the new file may be lost in a power loss
             sync(self._folder)
         except OSError:
             self._close_fd()

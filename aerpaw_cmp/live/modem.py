@@ -1,19 +1,19 @@
 """Commands that the tap may send to a Quectel RM5xxQ, and the meaning of its answers.
 
-Only commands in :data:`QUERIES` are sent, and all of these only read. The one command that writes, ``csi_ctrl``, needs
-``allow_csi=True``. No command requests IMEI, IMSI, ICCID or telephone numbers. :class:`Redactor` removes them if the
-modem sends them unasked.
+Only commands in :data:`QUERIES` are sent, and these do not change the modem. The only command that changes it,
+``csi_ctrl``, needs ``allow_csi=True``. No command requests IMEI, IMSI, ICCID or telephone numbers. If the modem sends
+these data unasked, :class:`Redactor` removes them.
 
 Layouts: Quectel RG520N&RG525F&RG5x0F&RM5x0N Series AT Commands Manual, section 5.20 (QENG); ``nr5g_csi`` as quoted
 at community.teltonika.lt/t/read-csi-information/5568. SA and EN-DC order RSRQ and SINR differently, so the meaning of a
 field depends on the line's radio access technology, not on its position alone. A field outside its physical range
-becomes None with a flag. The other fields and the raw line are kept.
+becomes None with a flag. All other fields and the raw line are kept.
 
 The module converts bytes of an AT port to answers and unsolicited lines, without file, port or clock.
 
-:class:`Framer` knows the command in flight. It returns the same events regardless of how the bytes are split. Its
-buffer is bounded: it stores a line up to :data:`_MAX_LINE_BYTES` and an answer up to ``max_lines``, and only counts the
-rest.
+:class:`Framer` is informed of the command in flight. It returns the same events regardless of how the bytes are split.
+Its buffer is bounded: a line is stored up to :data:`_MAX_LINE_BYTES`, and an answer up to ``max_lines``. The rest is
+only counted.
 
 A line ends at any run of CR and LF (a modem with echo ends the echo with CR CR LF). Bytes become text as Latin-1,
 so no byte is lost.
@@ -39,11 +39,11 @@ class Query:
     Parameters
     ----------
     name : str
-        Used in settings and in the log.
+        Name of the query in settings and in the log.
     text : str
-        The command, without its end.
+        The command, without line end.
     prefixes : tuple of str, or None
-        Prefixes of its information lines, without spaces. None: any line.
+        Prefixes of the information lines of its answer, without spaces. None: any line.
     decode : callable
         ``decode(lines, flags) -> values``; appends to ``flags``.
     """
@@ -91,7 +91,7 @@ def _split_fields(payload: str) -> list[str | None]:
 
 
 def _payload_of(line: str, prefix: str) -> str | None:
-    """Return the text after ``prefix``, without colon and spaces. None if the line starts otherwise."""
+    """Return the text after ``prefix``, without colon and spaces. None if the line does not start with ``prefix``."""
     if not line.startswith(prefix):
         return None
     return line[len(prefix) :].lstrip(": ")
@@ -134,7 +134,7 @@ def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -
     Parameters
     ----------
     name : str
-        Field, a key of ``_RANGES``.
+        Name of the field, a key of ``_RANGES``.
     text : str or None
         Text from the modem.
     flags : list of str
@@ -194,7 +194,7 @@ def _fields_of(lines: Sequence[str], prefix: str, flags: list[str]) -> Iterator[
 
 
 def _decode_csi(lines: Sequence[str], flags: list[str], which: str) -> Values:
-    """Decode ``+QNWCFG: "nr5g_csi",<mcs>,<ri>,<cqi>,<pmi>``. RI 0 means no CSI, so ``rank`` is None."""
+    """Decode ``+QNWCFG: "nr5g_csi",<mcs>,<ri>,<cqi>,<pmi>``. RI 0 means no CSI, so ``rank`` is then None."""
     rows = []
     for line in lines:
         payload = _payload_of(line, "+QNWCFG")
@@ -367,7 +367,7 @@ def encode(command: str, *, allow_csi: bool = False) -> bytes:
     Raises
     ------
     UsageError
-        If the command is not on the list, contains CR, LF or ``;``, or writes without ``allow_csi``.
+        If the command is not on the list, contains CR, LF or ``;``, or changes the modem without ``allow_csi``.
 
     Examples
     --------
@@ -427,7 +427,7 @@ class Redactor:
         self.count = 0
 
     def clean(self, text: str, *, cut: bool = False) -> str:
-        """Return the line without personal data. ``cut`` means that its end is missing."""
+        """Return the line without personal data. ``cut`` means that the end of the line is missing."""
         if self._message_follows and not text.startswith("+Q"):  # an answer may come before the message
             self._message_follows = False
             self.count += 1
@@ -462,8 +462,8 @@ class Answer:
     lines : tuple of str
         Information lines, without echo and final result.
     status : str
-        ``ok``, ``error``, ``cme``, ``cms``; or how it ended without a final result: ``timeout``, ``lost``
-        (port gone), ``cut`` (the next command or the end of a transcript).
+        ``ok``, ``error``, ``cme``, ``cms``, or the reason why there is no final result: ``timeout``, ``lost`` (the port
+        is gone), ``cut`` (the next command or the end of a transcript followed).
     code : str or None
         Text after ``+CME ERROR:`` or ``+CMS ERROR:``.
     flags : tuple of str
@@ -482,7 +482,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Unsolicited:
-    """A line that does not belong to a command. ``dropped`` is the number of its bytes that were not stored."""
+    """A line that does not belong to a command. ``dropped`` is the number of bytes of the line that were not stored."""
 
     text: str
     dropped: int = 0
@@ -490,7 +490,7 @@ class Unsolicited:
 
 @dataclass(frozen=True, slots=True)
 class Late:
-    """An answer that came after its time-out. It is stored, but not assigned to a query."""
+    """An answer that came after the time-out of its command. It is stored, but not assigned to a query."""
 
     lines: tuple[str, ...]
     status: Status
@@ -579,8 +579,8 @@ def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
 class Framer:
     r"""A parser of the answers to known commands, one of which is in flight at a time.
 
-    A command that timed out may still be answered. A late answer becomes a :class:`Late` event. It is distinguished
-    from the next command's answer by its prefix, or by the echo if the modem echoes.
+    A command that timed out may still be answered. A late answer becomes a :class:`Late` event. Its prefix, or the echo
+    if the modem echoes, distinguishes it from the answer to the next command.
 
     Parameters
     ----------
@@ -611,12 +611,12 @@ class Framer:
         command : str
             Command as written to the port, without the line end.
         prefixes : tuple of str, or None
-            Prefixes of its information lines, without spaces. ``()``: it has none. None: any line.
+            Prefixes of the information lines of its answer, without spaces. ``()``: no lines. None: any line.
         """
         self._open = _Open(command, prefixes, [], [])
 
     def feed(self, data: bytes) -> list[Event]:
-        """Return events that these bytes complete, in their order."""
+        """Return the events that these bytes complete, in order."""
         events: list[Event] = []
         *ends, rest = re.split(rb"[\r\n]", data)
         for end in ends:
@@ -648,7 +648,7 @@ class Framer:
     def give_up(self, status: Literal["timeout", "lost"] = "timeout") -> Answer:
         """End the command in flight without a final result.
 
-        After ``timeout`` the answer is still expected and may come late. After ``lost`` the buffer is emptied.
+        After ``timeout``, the answer may still come late. After ``lost``, the buffer is emptied.
         """
         assert self._open is not None
         now, self._open = self._open, None
@@ -661,7 +661,7 @@ class Framer:
             self._owed.clear()
         else:
             self._owed.append(now)
-            # a modem that never answers must not fill the memory
+            # limit the list: a modem that never answers must not fill the memory
             del self._owed[:-16]
         return answer
 
@@ -673,7 +673,7 @@ class Framer:
         return lines, self._take_partial()
 
     def settle(self) -> list[Event]:
-        """Expect no more late answers, because a probe was answered after all earlier commands."""
+        """Stop expecting late answers, because a probe was answered after all earlier commands."""
         self._owed.clear()
         if not self._stray:
             return []
@@ -707,12 +707,12 @@ class Framer:
     def _is_echo(self, text: str, now: _Open) -> bool:
         # remains of earlier output may precede the echo on the same line
         upper, command = text.upper(), now.command.upper()
-        # many lines that are not an echo end with a short command such as AT
+        # require long commands, because many lines that are not an echo end with a short command such as AT
         if now.echoed or not (upper == command or (len(command) > 6 and upper.endswith(command))):
             return False
         now.echoed = self._echo_seen = True
         self._flag("echo" if len(text) == len(now.command) else "echo_with_rubbish")
-        if self._owed and now.lines:  # these lines came before our echo, so they answer another command
+        if self._owed and now.lines:  # lines before our echo belong to an earlier command
             self._stray += now.lines
             now.lines.clear()
         return True
@@ -720,7 +720,7 @@ class Framer:
     def _final(self, status: Status, code: str | None, events: list[Event]) -> None:
         now = self._open
         if now is None or self._is_owed_final(now, status):
-            if now is not None:  # before the echo of our command, so it belongs to another command
+            if now is not None:  # before our echo, so it answers an earlier command
                 self._stray += now.lines
                 now.lines.clear()
             events.append(Late(tuple(self._stray), status, code))
@@ -738,7 +738,7 @@ class Framer:
         self._open = None
 
     def _is_owed_final(self, now: _Open, status: Status) -> bool:
-        """Check whether a final result ends a late answer, because a modem answers its commands in order."""
+        """Check whether a final result ends a late answer. A modem answers commands in order."""
         if not self._owed:
             return False
         if self._echo_seen and not now.echoed:

@@ -1,15 +1,16 @@
 """Serial ports of the tap: find the modem's AT port, open it exclusively, and report other processes that use it.
 
-The port is opened with ``termios`` directly. pyserial empties the input queue when it opens, which would lose waiting
-answers. It requires a DTR ioctl that some USB paths refuse, and reports an unplugged cable by three
-unrelated exceptions (its issues 401 and 417). Here an unplugged cable always raises :class:`PortGoneError`.
+The port is opened with ``termios`` directly. pyserial is not used, because it empties the input queue when it opens a
+port, so that waiting answers are lost. It also requires a DTR ioctl that some USB paths refuse, and reports an
+unplugged cable by three unrelated exceptions (its issues 401 and 417). Here an unplugged cable always raises
+:class:`PortGoneError`.
 
 The module also contains settings, status and summary of a session of the tap.
 
 A separate thread writes the status to the terminal, so that a hanging terminal (Ctrl-S, a lost ssh connection) does not
 delay a poll.
 
-A schedule determines which query is due when.
+A schedule determines when each query is due.
 
 A request to end wakes the waiting threads.
 """
@@ -51,12 +52,12 @@ _GONE = {errno.ENOENT, errno.ENXIO, errno.EIO, errno.ENODEV, errno.ENOTCONN, err
 
 
 class PortGoneError(Exception):
-    """The error for a port that does not exist at present. It may come back."""
+    """The error for a port that does not exist at present. The port may come back."""
 
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """A serial port and how it was found.
+    """A serial port, and how it was found.
 
     Parameters
     ----------
@@ -96,7 +97,7 @@ def _list_ports() -> list[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """The folder of devices and the list of serial ports. Tests use simulated ones."""
+    """The folder of devices and the list of serial ports. Tests use a simulated folder and list."""
 
     dev: Path = Path("/dev")
     ports: Callable[[], list[Any]] = _list_ports
@@ -141,10 +142,10 @@ def find_candidates(roots: Roots) -> list[PortInfo]:
 
 
 def find_port(path: Path, roots: Roots) -> PortInfo:
-    """Return what is known about a port.
+    """Return the properties of a port.
 
-    If a by-id name leads to the given ``/dev/ttyUSB*``, the port is followed by that name. It is then found again when
-    the modem comes back under another number.
+    If a by-id name leads to the given ``/dev/ttyUSB*``, that name is used. The port is then found again if the modem
+    comes back under another number.
 
     Raises
     ------
@@ -228,7 +229,7 @@ def _denied(path: Path) -> InputError:
 
 
 class SerialPort:
-    """An open port: raw, non-blocking, locked for us.
+    """An open port: raw, non-blocking, locked for this process.
 
     Use :meth:`open`. Every method raises :class:`PortGoneError` when the device is gone.
     """
@@ -244,7 +245,7 @@ class SerialPort:
         Raises
         ------
         PortGoneError
-            If the port does not exist or vanishes meanwhile.
+            If the port does not exist, or vanishes while it is opened.
         InputError
             If this user may not open the port, another process uses it, or it is not a serial port.
         """
@@ -255,11 +256,12 @@ class SerialPort:
         try:
             if not os.isatty(fd):
                 raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
-            users = holders(path)  # check this first, because another process may use the port
+            users = holders(path)  # before any change: another process may use the port
             if users:
                 raise _busy(path, users)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # the lock excludes other taps only; TIOCEXCL makes any further open fail, except for root
+            # the lock only excludes other taps. TIOCEXCL makes any further attempt to open the port fail, except for
+            # root.
             fcntl.ioctl(fd, termios.TIOCEXCL)
             make_raw(fd, termios.B115200)
             users = holders(path)  # check again: another process may have opened the port meanwhile
@@ -300,12 +302,12 @@ class SerialPort:
             return b""
         except OSError as error:
             raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
-        if not data:  # with VMIN=1 an empty read is a hang-up
+        if not data:  # with VMIN=1, an empty read means a hang-up
             raise PortGoneError(f"{self.path} is gone (hung up)")
         return data
 
     def write(self, data: bytes, timeout_s: float = 1.0) -> None:
-        """Write all bytes within the time. A port that accepts no bytes for this time counts as gone."""
+        """Write all bytes within the time. A port that does not accept bytes for this time counts as gone."""
         deadline = time.monotonic() + timeout_s
         while data:
             try:
@@ -333,7 +335,7 @@ def make_raw(fd: int, baud: int) -> None:
     # keep HUPCL: the system decides whether a modem is notified when its port closes
     cflag = (cflag & termios.HUPCL) | termios.CS8 | termios.CREAD | termios.CLOCAL
     cc[termios.VMIN], cc[termios.VTIME] = 1, 0
-    # every flag of input, output and local mode changes or delays bytes, so all are cleared
+    # clear all flags of input, output and local mode, because each of them changes or delays bytes
     termios.tcsetattr(fd, termios.TCSANOW, [0, 0, cflag, 0, baud, baud, cc])
 
 
@@ -346,19 +348,19 @@ class TapSettings:
     folder : Path
         Folder of the log segments (``-o``). Created if missing.
     port : str, optional
-        The serial port. None: the first AT port of a Quectel modem.
+        The serial port. None means the first AT port of a Quectel modem.
     ri_hz : float
         Rate of ``nr5g_csi`` [Hz].
     other_hz : float
         Rate of each of :data:`~aerpaw_cmp.live.modem.OTHER_QUERIES` [Hz].
     pause_s : float
-        Rest between an answer and the next command [s].
+        Pause between an answer and the next command [s].
     answer_timeout_s : float
-        An answer later than this is a ``late`` record [s].
+        Time after which an answer becomes a ``late`` record [s].
     probe_timeout_s : float
         Time limit for each of the two probes of a newly opened port [s].
     silent_s : float
-        The port is reopened after this time without a final result [s].
+        Time without a final result after which the port is reopened [s].
     enable_csi : bool
         Switch CSI reporting on, and restore it on exit (the only command that writes).
     no_csi_alarm_s : float, optional
@@ -368,11 +370,11 @@ class TapSettings:
     duration_s : float, optional
         End the session after this time [s].
     reconnect_min_s, reconnect_max_s : float
-        Back-off after a loss of the port [s].
+        Shortest and longest pause between attempts to reconnect [s].
     log : LogSettings
         Durability and rotation.
     roots : Roots
-        Folders where devices are searched.
+        Folders in which devices are searched for.
     """
 
     folder: Path
@@ -395,7 +397,7 @@ class TapSettings:
     def __post_init__(self) -> None:
         for name in ("ri_hz", "no_csi_alarm_s", "duration_s"):
             value = getattr(self, name)
-            # this form of the test also refuses NaN
+            # written in this way, the test also refuses NaN
             if value is not None and not 0 < value < 1e6:
                 raise UsageError(f"{name} is {value:g}", expected="a positive number below 1e6")
 
@@ -416,15 +418,15 @@ class TapStatus:
     gaps, records, bytes_written : int
     disk_free_bytes : int or None
     disk_fault : str
-        Reason why the disk cannot be written now. Empty if it can be written.
+        Reason why the disk cannot be written now. Empty if the disk can be written.
     missed : int
-        Poll slots that passed unused while connected.
+        Number of polls that were due while connected, but not made.
     predicted_rank : int or None
         Rank that the replay predicts at the present pose.
     predicts : bool
         True if the tap makes predictions.
     alarm : bool
-        True if there was no CSI for longer than the limit: the bell rings.
+        True if there was no CSI for longer than the limit, so that the bell rings.
     message : str
         Text to be shown once (a loss, a fault, a hint). Empty on regular calls.
     """
@@ -447,12 +449,12 @@ class TapStatus:
 
 
 class StatusNotifier:
-    """A thread that calls ``on_status`` in order. Statuses that a hanging terminal cannot take are dropped.
+    """A thread that calls ``on_status`` in order. A status is dropped if a hanging terminal cannot show it.
 
     Parameters
     ----------
     on_status : callable
-        If it raises, it is not called again, because a broken terminal must not end the log.
+        If it raises an exception, it is not called again, because a broken terminal must not end the log.
     """
 
     def __init__(self, on_status: Callable[[TapStatus], None]) -> None:
@@ -462,8 +464,8 @@ class StatusNotifier:
         self._thread.start()
 
     def notify(self, status: TapStatus) -> None:
-        """Queue a status. It is dropped if the queue is full, or if it has no message and ten others wait."""
-        # the terminal overwrites a line without a message by the next line, but shows a message only once
+        """Queue a status. It is dropped if the queue is full, or if it has no message and ten statuses wait."""
+        # lines without a message may be dropped, because the next line overwrites them. A message is shown only once.
         if status.message or self._queue.qsize() < 10:
             try:
                 self._queue.put_nowait(status)
@@ -501,7 +503,7 @@ class TapSummary:
     answers : mapping
         Counts by status, for each query.
     rates_hz, missed : mapping
-        For each query, the achieved rate, and the number of unused poll slots while connected.
+        For each query, the achieved rate, and the number of polls that were due while connected, but not made.
     gaps : int
     gap_s, duration_s : float
     records, lost_records, redacted : int
@@ -547,25 +549,26 @@ def format_status(status: TapStatus) -> str:
     return "  ".join(parts)
 
 
-# A slot that is late by at most this many periods is polled at once. Older slots are missed and counted.
+# A poll that is late by at most this number of periods is made immediately. Older polls are skipped and counted as
+# missed.
 _CATCH_UP = 2
 # The first query is polled at most this many times in a row while another query is due.
 _IN_A_ROW = 3
 
 
 def stale_after_s(period_s: float) -> float:
-    """Return the age from which a measured value is not the present one [s], for a period of the rank query [s]."""
+    """Return the age from which a measured value is out of date [s], for a period of the rank query [s]."""
     return max(3.0, 3 * period_s)
 
 
 class Schedule:
-    """The order and times of the queries. If several are due, the first query has priority, then the longest waiting.
+    """The order and times of the queries. If several are due, the first query has priority, then the longest wait.
 
-    If a modem answers so slowly that the first query is always due, one of the other queries is sent after every three
-    polls of the first.
+    If a modem answers so slowly that the first query is always due, another query is sent after every three polls of
+    the first query.
 
-    After a short stall the missed polls follow each other immediately, with their true times in the records, so no
-    answer is lost. After a long stall the schedule starts from now.
+    After a short stall, late polls follow each other immediately, with their true times in the records, so no answer is
+    lost. After a long stall, the schedule restarts at the present time.
 
     Parameters
     ----------
@@ -593,7 +596,7 @@ class Schedule:
         return name, self._due[name]
 
     def started(self, name: str, now_ns: int) -> None:
-        """Record that a poll begins. Slots that cannot be caught up are missed."""
+        """Record that a poll begins. Count polls that are too late to be made as missed."""
         period = self._periods[name]
         late = max(0, (now_ns - self._due[name]) // period)
         skipped = late if late > _CATCH_UP else 0
@@ -602,19 +605,19 @@ class Schedule:
         self._due[name] += (skipped + 1) * period
 
     def slots(self, duration_ns: int) -> dict[str, int]:
-        """Return the number of polls that a gap of this length costs."""
+        """Return the number of polls that are due within a gap of this length."""
         return {name: duration_ns // period for name, period in self._periods.items()}
 
 
 class Stop:
     """A request to end, from a signal or another thread. It wakes the waiting tap.
 
-    Inside a ``with`` block, SIGINT, SIGTERM and SIGHUP request the end; the block closes the request when it ends. Only
+    Inside a ``with`` block, SIGINT, SIGTERM and SIGHUP request the end. The end of the block closes the pipe. Only
     the main thread receives signals, and an ignored signal (nohup) stays ignored.
     """
 
     def __init__(self) -> None:
-        # a full pipe must not block a signal handler
+        # non-blocking: a full pipe must not block a signal handler
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self.reason = ""
         self.count = 0
@@ -638,7 +641,7 @@ class Stop:
             os.write(self._write, b"x")
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable once the end is requested."""
+        """Return a descriptor that is readable after the end was requested."""
         return self._read
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
 """The rank and level that the replay predicts for the present pose, computed in parallel with the polling.
 
-The tap passes a time and gets records back. The caller determines how a time becomes a pose and a pose a rank.
+The tap passes a time and gets records back. Functions of the caller convert a time to a pose, and a pose to a rank.
 :class:`~aerpaw_cmp.live.predict.TelemetryFollower` returns the pose from a telemetry log that is still being written.
 """
 
@@ -29,7 +29,7 @@ RANKS = (1, 4)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """The prediction at the pose of one moment, and the state of the telemetry at that moment.
+    """The prediction for the pose at one time, and the state of the telemetry at that time.
 
     Parameters
     ----------
@@ -38,13 +38,14 @@ class Prediction:
     level_dbm : float or None
         Predicted level before any offset [dBm].
     east_m, north_m, up_m : float or None
-        Position in the site frame. None: no pose for that time.
+        Position in the site frame. None if there is no pose at that time.
     fix : float or None
-        Kind of the GPS fix. Below 3 there is no position.
+        Kind of the GPS fix. A kind below 3 means that there is no position.
     telemetry_age_s : float or None
-        Age of the newest line of the telemetry log. None: there is no line yet.
+        Age of the newest line of the telemetry log. None if there is no line yet.
     telemetry_delay_s : float or None
-        Smallest recent delay of the telemetry lines. Negative if the telemetry's clock is ahead of ours.
+        Smallest recent delay of the telemetry lines. Negative if the clock of the telemetry is ahead of the clock of
+        this computer.
     """
 
     rank: int | None = None
@@ -57,7 +58,7 @@ class Prediction:
     telemetry_delay_s: float | None = None
 
 
-# ``predict(utc_ns)``; None: the pose at that time is unknown.
+# ``predict(utc_ns)`` returns None if the pose at that time is unknown.
 Predict = Callable[[int], "Prediction | None"]
 
 
@@ -76,7 +77,7 @@ class RunningInterval:
     Notes
     -----
     The bounds are order statistics of the last ``keep`` residuals. Neighbours in time are correlated, so quantiles
-    alone would cover less than ``share``. After each residual the tail share ``a`` therefore changes by
+    alone would cover less than ``share``. Therefore, after each residual, the tail share ``a`` is changed by
     ``a += step (1 - share - outside)`` (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170). This makes the long-run
     share correct for any sequence.
 
@@ -104,7 +105,7 @@ class RunningInterval:
         return self._sorted[len(self._sorted) // 2] if self._sorted else None
 
     def bounds(self) -> tuple[float, float] | None:
-        """Return bounds of the next residual. None if too few residuals are known or the interval is unbounded."""
+        """Return bounds of the next residual. None if there are too few residuals, or if the interval is unbounded."""
         n = len(self._sorted)
         if n < self._least or self._tails <= 0.0:
             return None
@@ -118,7 +119,7 @@ class RunningInterval:
         outside = bounds is not None and not bounds[0] <= residual <= bounds[1]
         if bounds is not None:
             self.given += 1
-            # count before adding the residual: an interval must not depend on the value that tests it
+            # count before adding the residual, because an interval must not depend on the value that tests it
             self.inside += not outside
         if len(self._sorted) >= self._least:
             self._tails += self.STEP * (1.0 - self._share - outside)
@@ -130,7 +131,7 @@ class RunningInterval:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A request for the prediction at an answer of the modem: its time, the time of its command, its values."""
+    """A request for the prediction at an answer of the modem, with the times of answer and command and the values."""
 
     utc_ns: int
     sent_utc_ns: int
@@ -148,7 +149,7 @@ class PredictionWorker:
 
     def __init__(self, predict: Predict) -> None:
         self._predict = predict
-        # only one request may wait: a prediction of the past would come too late for the pilot
+        # only one request may wait, because a prediction for an earlier time would be too late for the pilot
         self._wanted: queue.Queue[Asked | None] = queue.Queue(maxsize=1)
         self._done: deque[dict[str, Any]] = deque(maxlen=1000)
         self._rank, self._level = RunningInterval(), RunningInterval()
@@ -156,7 +157,7 @@ class PredictionWorker:
         self._thread.start()
 
     def ask(self, asked: Asked) -> None:
-        """Request the prediction for an answer, unless a request waits already."""
+        """Request the prediction for an answer, unless another request is waiting."""
         with contextlib.suppress(queue.Full):
             self._wanted.put_nowait(asked)
 
@@ -189,7 +190,7 @@ class PredictionWorker:
             self._done.append(result)
 
     def _compared(self, asked: Asked, now: Prediction) -> dict[str, Any]:
-        """Return the record's prediction, interval and residual. The measurement affects only later intervals."""
+        """Return prediction, interval and residual for the record. The measurement affects only later intervals."""
         places = ("east_m", "north_m", "up_m", "fix", "telemetry_age_s", "telemetry_delay_s")
         fields: dict[str, Any] = {"predicted": now.rank}
         fields |= {name: _rounded(getattr(now, name)) for name in places}
@@ -216,7 +217,7 @@ def _rounded(value: float | None) -> float | None:
 
 
 _MAX_AGE_S = 2.0
-# Only the end of the telemetry log is read: more than a hundred lines of vehicleOut.
+# Size of the end of the telemetry log that is read: more than a hundred lines of vehicleOut [bytes].
 _TAIL_BYTES = 16_384
 
 
@@ -272,7 +273,7 @@ class TelemetryFollower:
         InputError
             If the content is not telemetry.
         """
-        from ..logs import limits  # loads pandas, as any reader does
+        from ..logs import limits  # import here, because it loads pandas
 
         result = limits.check(self._reader.read(self._last_lines(), self._options))
         streams = [stream for stream in result.streams if stream.kind == "telemetry"]
@@ -298,7 +299,7 @@ class TelemetryFollower:
         return min(self._delays, default=None)
 
     def at(self, utc_ns: int) -> TelemetrySample | None:
-        """Return the sample nearest in time. None if it is farther away than :data:`_MAX_AGE_S`."""
+        """Return the sample nearest in time. None if the nearest sample is farther away than :data:`_MAX_AGE_S`."""
         near = min(self.samples, key=lambda sample: abs(sample.utc_ns - utc_ns), default=None)
         return None if near is None or abs(near.utc_ns - utc_ns) > _MAX_AGE_S * 1e9 else near
 

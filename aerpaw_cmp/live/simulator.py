@@ -1,6 +1,6 @@
 """A simulated modem: a pseudo-terminal that answers like an RM502Q-AE during a simulated flight.
 
-It answers any program that opens the port, so the tap, a terminal program and the tests use the same simulator.
+The simulator answers any program that opens the port, so it can be used with the tap, a terminal program and the tests.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class FlightModem:
         if write:
             self.csi = [int(write.group(1)), int(write.group(2))]
             return ("OK",)
-        # PMI counts the queries, so that each answer can be distinguished
+        # use the number of the query as PMI, so that each answer can be distinguished
         csi = f"{min(27, 4 + 6 * rank)},{rank},{min(15, 4 + 2 * rank)},{self._asked % 60_000}" if rank else "0,0,0,0"
         answers: dict[str, tuple[str, ...]] = {
             "sync": (),
@@ -99,7 +99,7 @@ class ModemSimulator:
     modem : FlightModem, optional
         Answers of the modem. Default: a built-in flight.
     link : Path, optional
-        Symbolic link to the port. None: no link.
+        Symbolic link to the port. None means no link.
 
     Examples
     --------
@@ -133,7 +133,7 @@ class ModemSimulator:
 
     @property
     def port(self) -> Path:
-        """The path to open: the link if there is one, else the node."""
+        """The path to open: the link if there is one, else the device node."""
         return self.link or self._node
 
     def _plug(self) -> Path:
@@ -142,8 +142,8 @@ class ModemSimulator:
             make_raw(slave, termios.B115200)
             node = Path(os.ttyname(slave))
         finally:
-            os.close(slave)  # only the tap must have the port open
-        # a reader that stops reading must not block the thread for ever
+            os.close(slave)  # only the tap may have the port open
+        # a program that stops reading must not block the thread forever
         os.set_blocking(master, False)
         self._master = master
         link = self.link
@@ -162,7 +162,7 @@ class ModemSimulator:
         return node
 
     def _unlink(self) -> None:
-        """Remove the link, if it is still the one to our node."""
+        """Remove the link if it still leads to our device node."""
         link = self.link
         with contextlib.suppress(OSError):
             if link is not None and link.readlink() == self._node:

@@ -1,8 +1,8 @@
 """The tap: it polls the modem, records every answer, and survives field conditions.
 
 There is one polling thread and one command in flight. A record is in the kernel before the next command is sent, unless
-the disk stalls (:class:`~aerpaw_cmp.live.log.TapLog`). The port may vanish and come back under another
-number, the disk may fill, the clock may step, signals may come. Each event is recorded, and the polling continues.
+the disk stalls (:class:`~aerpaw_cmp.live.log.TapLog`). The port may vanish and come back under another number, the disk
+may fill, the clock may step, signals may come. Each of these events is recorded, and the polling continues.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from . import modem, ports
 from .log import Clock, TapLog, boot_id, clock_synchronised
 from .predict import Asked, Predict, PredictionWorker
 
-# A jump of the wall clock against the monotonic clock is recorded if it exceeds this.
+# A jump of the wall clock relative to the monotonic clock is recorded if it exceeds this.
 _CLOCK_STEP_NS = 50_000_000
-# Readings of the two clocks farther apart than this are not compared, because the process was paused between them.
+# The two clocks are not compared if more than this passed between reading them, because the process was paused.
 _PAUSE_NS = 5_000_000
 # A function that receives each logged record and each status in the polling thread. It must neither wait nor raise.
 Watch = Callable[["Record | ports.TapStatus"], None]
@@ -52,7 +52,7 @@ _NMEA = re.compile(rb"\$[A-Z]{4,5},[^\r\n]*\*[0-9A-F]{2}")
 
 
 def _not_a_modem(path: Path, received: bytes) -> InputError:
-    """Return the error for a port that does not answer ``AT``. The cause depends on the received bytes."""
+    """Return the error for a port that does not answer ``AT``. The likely cause depends on the received bytes."""
     expected = "an answer to 'AT' (interface 02 or 03 of the modem)"
     if _NMEA.search(received):
         sign, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the port numbers changed"
@@ -83,7 +83,7 @@ class Tap:
     watch : callable, optional
         Receives each logged record and each status. It must neither wait nor raise.
     predict : callable, optional
-        ``predict(utc_ns)`` returns the Prediction at the pose of that time, or None. It runs in a separate thread.
+        ``predict(utc_ns)`` returns the Prediction for the pose at that time, or None. It runs in a separate thread.
     clock : Clock, optional
     """
 
@@ -244,7 +244,7 @@ class Tap:
         )
 
     def _restore_csi(self) -> bool | None:
-        """Restore the former state of CSI reporting. None if it was not changed."""
+        """Restore the former state of CSI reporting. None if the state was not changed."""
         if not self._csi_changed:
             return None
         if self._port is not None and self._csi_before is not None and self._stop.count < 2:
@@ -281,7 +281,7 @@ class Tap:
         found = []
         with contextlib.suppress(ports.PortGoneError):
             now = ports.find_port(last.path, roots)
-            if now.interface == last.interface:  # otherwise this number now belongs to another port of the modem
+            if now.interface == last.interface:  # else the number belongs to another port of the modem
                 found.append(now)
         if last.product is not None:
             known = {port.device for port in found}
@@ -306,7 +306,7 @@ class Tap:
         self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
 
     def _probe(self) -> bool:
-        """Send a bare ``AT``. Its answer shows that no answer to an earlier command is pending."""
+        """Send a bare ``AT``. An answer shows that no answer to an earlier command is pending."""
         if self._exchange("sync", timeout_s=self._settings.probe_timeout_s)["status"] in ("timeout", "lost"):
             return False
         self._in_step = True
@@ -320,7 +320,7 @@ class Tap:
             self._port = None
 
     def _leave_framer(self) -> None:
-        """Record lines and a partial line that belong to no answer, before the framer is replaced."""
+        """Record lines and a partial line that do not belong to an answer, before the framer is replaced."""
         lines, partial = self._left()
         if lines or partial:
             self._event("unsolicited", lines=lines, partial=partial, dropped_bytes=0)
@@ -391,7 +391,7 @@ class Tap:
         decoded = self._exchange("csi_ctrl")["decoded"]
         state = decoded.get("lte"), decoded.get("nr5g")
         if self._settings.enable_csi and state != (1, 1):
-            # keep the state of the first connection: the modem may have lost it after it was replugged
+            # keep the state from the first connection, because the modem may lose it when it is plugged in again
             if None not in state and self._csi_before is None:
                 self._csi_before = (int(state[0] or 0), int(state[1] or 0))
             self._csi_changed = self._exchange("csi_ctrl", modem.csi_write(1, 1))["status"] == "ok"
@@ -416,7 +416,7 @@ class Tap:
         query = modem.QUERIES[name]
         text = command or query.text
         data = modem.encode(text, allow_csi=self._settings.enable_csi)
-        # unsolicited lines must not be read as part of the answer
+        # read unsolicited lines first: they must not be taken for a part of the answer
         self._drain()
         sent_utc, sent = self._clock.utc_ns(), self._clock.mono_ns()
         timeout_ns = int((timeout_s or self._settings.answer_timeout_s) * 1e9)
@@ -439,7 +439,8 @@ class Tap:
             now = self._clock.mono_ns()
             if self._stop.count and not stopped_at:
                 stopped_at = now
-                # wait one second for the pending answer, so that its record is complete; a second stop ends this wait
+                # wait one second for the pending answer, so that its record is complete. A second stop request ends
+                # this wait.
                 deadline = min(deadline, now + 1_000_000_000)
             if now >= deadline or self._stop.count > 1:
                 # the answer may still arrive: send no other query until a bare AT is answered
@@ -459,7 +460,7 @@ class Tap:
         data = self._port.read()
         self._received += len(data)
         if self._first_bytes is not None:
-            # keep enough bytes to distinguish NMEA from DIAG, but not all that a wrong port sends
+            # keep enough bytes to distinguish NMEA from DIAG, but not everything that a wrong port sends
             self._first_bytes += data[: 4096 - len(self._first_bytes)]
         answer = None
         for event in self._framer.feed(data):
@@ -487,7 +488,7 @@ class Tap:
             "command": answer.command,
             "sent_utc_ns": sent_utc,
             "sent_mono_ns": sent,
-            "last_utc_ns": sent_utc + last - sent,  # a clock step inside an exchange gets a separate record
+            "last_utc_ns": sent_utc + last - sent,  # a clock step within an exchange has its own record
             "last_mono_ns": last,
             "status": answer.status,
             "lines": lines,
@@ -513,7 +514,8 @@ class Tap:
             if status == "ok":
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
-                    # use the pose at the middle of the exchange, because the time of the rank within it is unknown
+                    # use the pose at the middle of the exchange, because it is unknown when the modem determined the
+                    # rank
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
                     self._worker.ask(Asked(middle, record["sent_utc_ns"], decoded.get("rank"), self._last["rsrp_dbm"]))
             elif status in ("error", "cme"):
@@ -532,7 +534,7 @@ class Tap:
             self._event("late", lines=lines, status=event.status, code=event.code)
         elif isinstance(event, modem.Unsolicited):
             self._noise["lines"] += 1
-            # above this rate, log only lines that a modem sends: a wrong port could fill the disk
+            # above this rate, log only lines of kinds that a modem sends: a wrong port could fill the disk
             if self._noise["lines"] > _NOISE_LINES_PER_S and not modem.is_unsolicited(event.text):
                 self._noise["bytes"] += len(event.text) + event.dropped
                 self._noise["not_kept"] += 1
@@ -552,7 +554,7 @@ class Tap:
             poller.register(self._stop.fileno(), select.POLLIN)
         if self._port is not None:
             poller.register(self._port.fileno(), select.POLLIN)
-        # also wake for the periodic tasks
+        # return in time for the periodic tasks
         ready = poller.poll(max(0.0, min(timeout_s, self._settings.status_s)) * 1e3)
         return any(fd != self._stop.fileno() for fd, _ in ready)
 
@@ -621,7 +623,7 @@ class Tap:
     # messages ---------------------------------------------------------------------------------------------
 
     def _say_once(self, text: str) -> None:
-        # limited, because messages of other programs may differ every time
+        # limit the number, because messages of other programs may differ every time
         if text not in self._said and len(self._said) < 100:
             self._said.add(text)
             self._say(text)
@@ -656,13 +658,13 @@ class Tap:
             self._watch(status)
 
     def _event(self, kind: str, **fields: Any) -> None:
-        """Record an event of this moment."""
+        """Record an event with the present time."""
         self._record({"kind": kind, **fields, **self._now()})
 
     def _record(self, record: Record) -> None:
         if self._early is None:
             self._append(record)
-        # a port that sends without end must not fill the memory
+        # limit the number: a port that sends without end must not fill the memory
         elif len(self._early) < 10_000:
             self._early.append(record)
 

@@ -1,12 +1,12 @@
 """The tap's page for browsers: one page and one stream of events, with the standard library.
 
 The server only answers GET requests for ``/`` and ``/events``, and reads no file. It refuses requests from other sites
-(Host, Origin, Sec-Fetch-Site), so that a page on the Internet cannot read it by DNS rebinding. Every request needs the
-token of the printed address, because all users of a machine share the loopback. The first visit with the token sets a
-cookie that replaces it.
+(Host, Origin, Sec-Fetch-Site), so that a page on the Internet cannot read the data by DNS rebinding. Every request
+needs the token of the printed address, because all users of a machine share the loopback. The first visit with the
+token sets a cookie, which then replaces the token.
 
 Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`. A browser that does not read for some
-seconds is disconnected. When it comes back, it gets the data that it missed. The tap never waits for it.
+seconds is disconnected. When it comes back, it gets the data that it missed. The tap never waits for a browser.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from .feed import Feed
 
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
-# Bytes written to a browser's socket at once. The time limit applies to each piece, so that a slow connection is not
-# closed like a broken one.
+# Number of bytes that are written to a browser's socket at a time. The time limit applies to each piece, so that a slow
+# connection is not mistaken for a broken connection.
 _PIECE = 16_384
-# Limit of connections, of all addresses, that wait for their request.
+# Largest number of connections, from all addresses, whose request is not complete.
 _MOST_WAITING = 256
 _TOKEN_WANTED = "the token is missing or wrong: use the address that the tap printed"
 _NO_TOKEN = f"HTTP/1.0 403 Forbidden\r\nContent-Type: text/plain\r\n\r\n{_TOKEN_WANTED}\n".encode()
@@ -53,13 +53,13 @@ class Page:
 
     @property
     def digest(self) -> str:
-        """The identity of the page. A browser that shows another page reloads it."""
+        """The identity of the page. A browser that shows another version reloads the page."""
         return hashlib.sha256(self.body).hexdigest()[:16]
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits of what browsers may use.
+    """The limits for browsers.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Limits:
     request_s : float
         Longest time between a connection and the end of its request [s].
     send_s : float
-        A browser that does not read for this time is disconnected [s].
+        Time after which a browser that does not read is disconnected [s].
     tick_s : float
         Interval at which the tap's queue is processed, and between messages to one browser [s].
     """
@@ -107,7 +107,7 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """True if only this computer can reach it."""
+        """True if only this computer can reach the address."""
         return _is_loopback(self.host)
 
     def __str__(self) -> str:
@@ -117,9 +117,9 @@ class Address:
 class WebServer(ThreadingHTTPServer):
     """A server of the page of one feed, as a context. Browsers with the token have a thread each.
 
-    A connection waits in one loop until its request is complete, for a limited time. Requests without the token are
-    refused there, without a thread. If too many connections wait, those of the most frequent address are closed, so a
-    flood only blocks its address.
+    All connections wait in one loop until their requests are complete, for a limited time. The loop refuses requests
+    without the token, so they do not need threads. If too many connections wait, connections of the most frequent
+    address are closed, so that a flood blocks only its own address.
 
     Parameters
     ----------
@@ -127,8 +127,8 @@ class WebServer(ThreadingHTTPServer):
     page : Page
     address : Address
     token : str, optional
-        The token that the URL must contain. A token that the user sets is secret and is not printed. None or empty: a
-        random token.
+        The token that the URL must contain. A token that the user sets is secret and is not printed. If it is None or
+        empty, a random token is used.
     limits : Limits
 
     Raises
@@ -148,8 +148,8 @@ class WebServer(ThreadingHTTPServer):
         self.feed, self.page, self.limits = feed, page, limits or Limits()
         self._printed = not token
         self.token = token or secrets.token_urlsafe(12)
-        # The cookie is not the token itself and is below a path that only this server knows: a browser sends cookies of
-        # 127.0.0.1 to every port of this computer, and another user may listen on one of them.
+        # The cookie is not the token itself, and its path is known only to this server: a browser sends cookies of
+        # 127.0.0.1 to every port of this computer, and another user may listen on one of these ports.
         self.pass_word = hmac.new(self.token.encode(), b"cookie", "sha256").hexdigest()
         self.base = f"/{hmac.new(self.token.encode(), b'path', 'sha256').hexdigest()[:32]}/"
         self._secrets = quote(self.token).encode(), self.pass_word.encode()
@@ -172,7 +172,7 @@ class WebServer(ThreadingHTTPServer):
         return self
 
     def __exit__(self, *exc: object) -> None:
-        """Wait a moment until browsers have the latest data, and close."""
+        """Wait a moment until browsers have the latest data, and close the server."""
         self.feed.digest()
         self.closing = True
         until = time.monotonic() + 1.5
@@ -200,7 +200,7 @@ class WebServer(ThreadingHTTPServer):
             time.sleep(self.limits.tick_s)
 
     def server_bind(self) -> None:
-        """Bind without looking up the name of this computer, which may need the network."""
+        """Bind without looking up the name of this computer. The look-up may need the network."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
@@ -221,9 +221,9 @@ class WebServer(ThreadingHTTPServer):
             request.close()
 
     def _accept(self, ready: selectors.BaseSelector) -> None:
-        """Let a connection wait for its request.
+        """Accept a connection, which then waits for its request.
 
-        If too many connections wait, close the oldest connection of the address that has the most.
+        If too many connections wait, close the oldest connection from the address with the most connections.
         """
         try:
             request, address = self.socket.accept()
@@ -244,7 +244,7 @@ class WebServer(ThreadingHTTPServer):
         del self.waiting[request]
 
     def _read(self, request: Any, ready: selectors.BaseSelector) -> None:
-        """Read a part of a request. Pass a complete request with the token to a thread, and refuse others."""
+        """Read a part of a request. Pass a complete request with the token to a thread. Refuse all other requests."""
         if request not in self.waiting:
             return  # the request was closed earlier in this loop
         waiting, data = self.waiting[request], b""
@@ -272,7 +272,7 @@ class WebServer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def let_in(self, request: Any) -> bool:
-        """Register a connection that showed the token. Return False if too many of these are open."""
+        """Register a connection with the token. Return False if too many connections with the token are open."""
         with self._lock:
             if len(self.browsers) >= self.limits.connections:
                 return False
@@ -280,7 +280,7 @@ class WebServer(ThreadingHTTPServer):
             return True
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing: a browser that disconnects is not an error, and the tap prints its status on the terminal."""
+        """Do not print anything: a disconnecting browser is not an error, and the terminal shows the tap's status."""
 
 
 @dataclass(slots=True)
@@ -303,7 +303,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().setup()
         self.rfile = io.BytesIO(self.server.heads.pop(self.request))
         self.connection.settimeout(self.server.limits.send_s)
-        # a small kernel buffer shows sooner that a browser does not read
+        # use a small kernel buffer, to notice earlier that a browser does not read
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * _PIECE)
 
     def do_GET(self) -> None:
@@ -335,7 +335,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._events(self.headers.get("Last-Event-ID") or query.get("from", ""))
 
     def _refusal(self, path: str, query: dict[str, str], private: bool) -> tuple[HTTPStatus, str] | None:
-        """Return status and reason with which the request is refused, None if it is answered."""
+        """Return status and reason with which the request is refused, None if the request is answered."""
         web, headers = self.server, self.headers
         hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
         if len(hosts) != 1 or not _own_host(hosts[0], web.address.loopback):
@@ -356,7 +356,7 @@ class _Handler(BaseHTTPRequestHandler):
         return f"aerpaw_tap_{self.server.address.port}"
 
     def _has_token(self, query: dict[str, str], private: bool) -> bool:
-        """Check whether a request has the token in its address, or below the private path the cookie of a visit."""
+        """Check whether a request has the token in its address or, below the private path, the cookie."""
         pairs = (item.strip().partition("=") for item in self.headers.get("Cookie", "").split(";"))
         cookie = next((value for name, _, value in pairs if private and name == self._cookie), "")
         # compare in constant time: the duration of a refusal must not show how much of the token was right
@@ -391,7 +391,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def end_headers(self) -> None:
-        """End the head with the headers that every answer has."""
+        """End the head of an answer with the headers that every answer has."""
         for name, value in (
             ("Content-Security-Policy", self.server.page.policy),
             ("X-Content-Type-Options", "nosniff"),
@@ -405,7 +405,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:  # noqa: ARG002
-        """Answer requests that http.server refuses. The answer contains nothing from the request."""
+        """Answer requests that http.server refuses. The answer does not repeat any part of the request."""
         self._text(HTTPStatus(code), HTTPStatus(code).phrase)
 
     def _text(self, status: HTTPStatus, text: str) -> None:
@@ -418,7 +418,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(data[start : start + _PIECE])
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Print nothing, because the tap prints its status on the terminal."""
+        """Do not print anything, because the tap shows its status on the terminal."""
 
 
 def _is_loopback(host: str) -> bool:
@@ -431,7 +431,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _own_host(text: str, loopback: bool) -> bool:
-    """Check whether a Host header names this computer by an address or its host name. The port may be a tunnel's."""
+    """Check whether a Host header names this computer by address or host name. Its port may be that of a tunnel."""
     match = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(:[0-9]{1,5})?", text)
     if match is None:
         return False
@@ -443,7 +443,7 @@ def _own_host(text: str, loopback: bool) -> bool:
         ipaddress.ip_address(host)
     except ValueError:
         return host in (own, f"{own.split('.')[0]}.local")
-    return True  # a numeric address cannot be rebound by DNS, so it means this computer
+    return True  # DNS cannot redirect a numeric address
 
 
 def _outward() -> list[str]:

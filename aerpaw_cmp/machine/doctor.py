@@ -1,6 +1,6 @@
-"""Checks whether this machine is ready. Each reports what it found and, if there is a problem, how to fix it.
+"""Checks whether this machine is ready. Each check reports its finding and, if there is a problem, how to fix it.
 
-These checks do not change the machine. ``tools/setup_llvm.py`` (run by ``make setup``) does.
+The checks do not change the machine. ``tools/setup_llvm.py``, which ``make setup`` runs, does.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from ..propagation.compiled import thread_count
 
 Status = Literal["ok", "warn", "fail"]
 
-# A report of 10 000 poses and 5 towers stays below this.
+# Memory that a report needs: a report of 10 000 poses and 5 towers stays below this.
 _MEMORY_NEEDED_BYTES = 2 * 1024**3
 
-# Reports, flight files and the path cache of a day in the field.
+# Disk space for reports, flight files and the path cache of a day in the field.
 _DISK_NEEDED_BYTES = 1024**3
 
 
@@ -41,11 +41,11 @@ class Check:
     name : str
         Name of the check.
     status : {"ok", "warn", "fail"}
-        ``warn``: jobs that need it are slow or refused, and all other jobs run. ``fail``: a command cannot run.
+        ``warn``: jobs that need this part are slow or refused, and all other jobs run. ``fail``: a command cannot run.
     found : str
-        What was found.
+        Finding of the check.
     remedy : str
-        How to fix it. Empty if ``ok``.
+        How to fix the problem. Empty if ``ok``.
     """
 
     name: str
@@ -93,9 +93,9 @@ def package_checks() -> Iterator[Check]:
     pins: dict[str, str] = {}
     missing: Status = "warn" if versions.version("sionna-rt") == versions.NOT_INSTALLED else "fail"
     with suppress(metadata.PackageNotFoundError):
-        # read from what is installed: another sionna-rt pins other versions of Mitsuba and Dr.Jit
+        # read the pins of the installed sionna-rt: another version of it pins other versions of Mitsuba and Dr.Jit
         for requirement in metadata.requires("sionna-rt") or []:
-            # a requirement without an exact version leaves an empty pin, which no version fails
+            # a requirement without an exact version results in an empty pin, which every version satisfies
             name, _, exact = requirement.partition("==")
             pins[name.strip()] = exact.strip()
     for title, name in (("Sionna RT", "sionna-rt"), ("Mitsuba", "mitsuba"), ("Dr.Jit", "drjit")):
@@ -153,7 +153,7 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
     except (OSError, StopIteration, ValueError, IndexError):
         return None
     group = root / "sys/fs/cgroup"
-    with suppress(OSError, ValueError):  # without such a group the memory of the machine is the limit
+    with suppress(OSError, ValueError):  # without a control group, the memory of the machine is the limit
         # names of control groups of version 2; version 1 is not read
         limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
         if limit != "max":
@@ -188,7 +188,7 @@ def cache_check(folder: Path) -> Check:
     existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
     if not existing.is_dir():
         return Check("Cache", "warn", f"{existing} is not a folder", remedy)
-    # a folder without the right to enter refuses new files, even if it is writable
+    # files cannot be created in a folder without the right to enter it, even if it is writable
     if not os.access(existing, os.W_OK | os.X_OK):
         return Check("Cache", "warn", f"{folder} cannot be written to", remedy)
     return Check("Cache", "ok", str(folder))
@@ -222,7 +222,7 @@ def serial_checks() -> Iterator[Check]:
             found = "is not installed" if isinstance(error, ModuleNotFoundError) else f"cannot be loaded ({error})"
             yield Check("Serial", "fail", f"pyserial {found}", "make setup")
         return
-    # ttyS* are sockets of the main board, listed whether or not anything is plugged in
+    # ignore ttyS*: these ports of the main board are listed even if no device is plugged in
     ports = sorted(port for port in list_ports.comports() if port.vid is not None or "ttyS" not in port.device)
     if not ports:
         yield Check("Serial", "ok", "no USB serial port: plug the modem in to use 'aerpaw-cmp tap'")
@@ -236,7 +236,7 @@ def serial_check(device: str, description: str = "") -> Check:
 
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
-        # the kernel applies a new group to new logins only
+        # membership of a new group starts with the next login
         group = "dialout"
         with suppress(OSError, KeyError, NotImplementedError):
             group = Path(device).group()  # dialout on Debian, uucp on Arch

@@ -1,1 +1,1 @@
-"""Grids, spatial correlation, Kriging and its baselines."""
+"""Maps: grids, spatial correlation, Kriging and its baselines."""

@@ -7,14 +7,15 @@ and a curve over the index is evaluated at the index of the target. The curves f
 - ``spline``: cubic with not-a-knot ends; a parabola for three samples, a line for two.
 - ``makima``: modified Akima piecewise cubic Hermite; a line for two samples.
 
-Beyond the first and last sample the end piece is extrapolated. The value is that of the sample if there is only one,
-and NaN if there is none.
+Beyond the first and last sample the end piece is extrapolated. If there is only one sample, its value is used. If there
+is no sample, the value is NaN.
 
-Three further baselines are the nearest sample, inverse distance, and the mean over the area that a tower serves.
-All classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
-:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`. They have no error estimate, so the variance they return is NaN.
+Three further baselines are the nearest sample, inverse distance, and the mean over the area that a tower serves. All
+classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
+:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`. They do not estimate their error, so the variance that they return is
+NaN.
 
-Interpolators are scored by leave-one-out, as in the paper, and by blocks, in which close neighbours are held out, too.
+Interpolators are scored by leave-one-out, as in the paper, and by blocks, so that close neighbours are held out, too.
 Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the
 interpolated number. A position without a value (NaN, out of coverage) or without an estimate is not scored.
 """
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-# Targets whose samples are stacked at once, which limits the memory.
+# Number of targets whose samples are stacked at a time. It limits the memory that is used.
 CHUNK = 512
 
 
@@ -87,12 +88,12 @@ def _makima_tangents(slope: FloatArray) -> FloatArray:
     padded = np.concatenate(
         [2 * before - slope[..., :1, :], before, slope, after, 2 * after - slope[..., -1:, :]], axis=-2
     )
-    # the term with the sum is MATLAB's, because Akima's weights overshoot where data become constant
+    # the term with the sum is from MATLAB: with Akima's weights alone, the curve overshoots where data become constant
     weight = np.abs(np.diff(padded, axis=-2)) + np.abs(padded[..., 1:, :] + padded[..., :-1, :]) / 2
     left, right = weight[..., 2:, :], weight[..., :-2, :]
     total = left + right
     some = total > 0
-    # both weights are 0 only where the data are constant on both sides, and the tangent is 0
+    # if the data are constant on both sides, both weights are 0, and the tangent is 0
     mixed = left * padded[..., 1:-2, :] + right * padded[..., 2:-1, :]
     return np.where(some, mixed / np.where(some, total, 1.0), 0.0)
 
@@ -147,7 +148,7 @@ def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
 def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) -> FloatArray:
     """Evaluate a piecewise cubic Hermite curve at one abscissa per row. The end pieces continue outside."""
     m = x.shape[-1]
-    # clip the number of the piece, because the end pieces are extrapolated
+    # clip the number of the piece, so that the end pieces are extrapolated
     piece = np.clip((x <= at[..., None]).sum(axis=-1) - 1, 0, m - 2)[..., None]
     left, right = np.take_along_axis(x, piece, -1), np.take_along_axis(x, piece + 1, -1)
     low, high = piece[..., None], piece[..., None] + 1
@@ -233,7 +234,7 @@ class IndexInterpolation(_Local):
     kind : {"spline", "makima"}
         Kind of curve.
     grid : Grid
-        Determines the index of each sample and target. All must lie in distinct cells.
+        Grid that determines the index of each sample and target. All samples must be in different cells.
     neighbours, radius_m, selection, seed
         The same as in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`.
     """
@@ -258,7 +259,7 @@ class InverseDistance(_Local):
     def _combine(self, targets: FloatArray, samples: FloatArray, values: FloatArray) -> FloatArray:
         far = np.linalg.norm(samples - targets[:, None], axis=-1)
         at = far < kriging.TIE_M
-        # use distances relative to the nearest sample, to prevent overflow
+        # use distances relative to that of the nearest sample, to prevent overflow
         ratio = far[:, :1] / np.where(at, 1.0, far)
         weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -342,7 +343,7 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
 
 
 def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> Score:
-    """Score the estimate of each position from all others, as in the paper, for values (n, altitudes, K)."""
+    """Score the estimate of each position from all other positions, as in the paper, for values (n, altitudes, K)."""
     data = unmasked(values)
     return score(data, model.fit(points_m, data).leave_one_out()[0])
 
@@ -377,13 +378,13 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     estimate = np.full_like(data, np.nan)
     for number in np.unique(block):
         test = block.ravel() == number
-        # if one block contains all samples, there are no training samples, and it is not scored
+        # skip a block that contains all samples, because there are no training samples
         if not test.all():
             estimate[test], _ = model.fit(points[~test], data[~test]).predict(points[test])
     return score(data, estimate)
 
 
-# Lowest altitude of interpolation in the paper, which uses 3 m only to show blockage.
+# Lowest altitude of the interpolation in the paper [m]. The paper uses 3 m only to show blockage.
 LOWEST_M = 30.0
 
 
@@ -394,7 +395,7 @@ class Study:
     Parameters
     ----------
     correlation : BinnedCorrelation
-        Correlation of the vectors of two positions.
+        Correlation of the vectors of two positions against distance.
     fit : BiExponential
         Curve fitted to the correlation.
     scores : mapping of str to Score
@@ -414,7 +415,7 @@ TREATMENTS = {"zero": "out of coverage as rank 0", "missing": "out of coverage e
 def rank_fields(
     result: MapResult, out_of_coverage: Literal["missing", "zero"] = "missing"
 ) -> tuple[tuple[float, ...], FloatArray]:
-    """Return altitudes and joint ranks (n, altitudes, K) to interpolate, from ``LOWEST_M`` on as in the paper.
+    """Return altitudes from ``LOWEST_M`` on, as in the paper, and the joint ranks (n, altitudes, K) to interpolate.
 
     ``out_of_coverage`` determines whether a rank of 0 becomes NaN (no sample) or stays the number 0.
 
@@ -450,7 +451,7 @@ def interpolation_study(grid: Grid, values: FloatArray, towers_m: FloatArray, sa
     correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m)
     fit = _curve(correlation)
     models: dict[str, Predictor] = {
-        # a single sample has the weight 1 at any distance
+        # with a single neighbour, its weight is 1 at any distance
         "nearest": InverseDistance(neighbours=1, radius_m=radius_m),
         "inverse distance": InverseDistance(neighbours=m, radius_m=radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
@@ -494,6 +495,6 @@ def kriging_wins(scores: Mapping[str, Score]) -> int:
 def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:
     if np.isfinite(correlation.correlation[1:]).any():
         return variogram.fit_biexponential(correlation.distance_m, correlation.correlation)
-    # Kriging requires a curve, and reports that this curve was not fitted to these data
+    # Kriging requires a curve, so use that of the paper, and report that it was not fitted to these data
     reason = "no two positions have varying rank vectors: the paper's curve is used"
     return replace(variogram.PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)

@@ -1,7 +1,7 @@
-"""Maps as files for other programs: CSV, KMZ, and a dataset after CF-1.11 for NetCDF and Zarr.
+"""Maps as files for other programs: CSV, KMZ, and a dataset according to CF-1.11 for NetCDF and Zarr.
 
-``write_csv`` and ``write_kmz`` take :class:`MapLayers`: a grid, the frame of the site and any layers, such as a level,
-its standard deviation or classes. A position out of coverage is an empty cell of the CSV, or the class 0 ("Z"). Samples
+``write_csv`` and ``write_kmz`` write :class:`MapLayers`: a grid, the frame of the site, and layers such as a level, its
+standard deviation or classes. A position out of coverage is an empty cell of the CSV, or the class 0 ("Z"). Samples
 along a flight are written by :mod:`aerpaw_cmp.report.kmz`.
 
     level = Layer(name="level_db", quantity="Level", unit="dBm", values=grid.raster(level_dbm))
@@ -10,9 +10,10 @@ along a flight are written by :mod:`aerpaw_cmp.report.kmz`.
 
 Each function replaces an existing file and returns its path.
 
-:func:`maps_dataset` has arrays over foliage, tower, K, height, y and x, rounded to 0.01 dB, which is finer than the
-data of the site. Maps in which the nearest tower serves are separate variables (``..._joint``). They contain the
-values that ``serving_tower`` selects from the maps of each tower. NetCDF requires ``pip install aerpaw-cmp[geo]``.
+:func:`maps_dataset` returns arrays over foliage, tower, K, height, y and x, rounded to 0.01 dB, which is finer than the
+accuracy of the site's data. Maps in which the nearest tower serves each position are separate variables
+(``..._joint``). They contain the values that ``serving_tower`` selects from the maps of each tower. NetCDF requires
+``pip install aerpaw-cmp[geo]``.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ class MapLayers:
     borders : sequence of Border
         Lines between the areas that two towers serve.
     credit : str
-        Attribution of the map from which the site was made, which its licence requires in derived works. Empty if there
-        is none. The CSV does not contain it.
+        Attribution of the map from which the site was made. The licence of the map requires it in derived works. Empty
+        if there is no attribution. It is not written to the CSV.
     """
 
     grid: Grid
@@ -81,7 +82,7 @@ class MapLayers:
 
 
 def write_csv(path: str | Path, maps: MapLayers) -> Path:
-    """Write a CSV with a row per position in index order: numbers, positions, and the layers."""
+    """Write a CSV with a row per position in index order: number, position, and the layers."""
     import pandas as pd
 
     points, (rows, columns) = maps.grid.points_m, maps.grid.shape
@@ -93,7 +94,8 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
         "latitude_deg": np.round(latitude, 9), "longitude_deg": np.round(longitude, 9),
         **{layer.column: layer.cells for layer in maps.layers},
     }  # fmt: skip
-    # guard text, because names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
+    # guard texts, because names of towers may come from a third party, and a spreadsheet executes a cell that begins
+    # with =
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
     return target
@@ -103,7 +105,7 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
 
 
 def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and rank") -> Path:
-    """Write a KMZ with an overlay and a legend per layer, of which the first is visible, with towers and borders."""
+    """Write a KMZ with towers, borders, and an overlay and a legend per layer. Only the first layer is visible."""
     north, south, east, west = _bounding_box(maps)
     box = f"<north>{north:.9f}</north><south>{south:.9f}</south><east>{east:.9f}</east><west>{west:.9f}</west>"
     parts = [
@@ -152,7 +154,7 @@ LEVELS = 10
 class Scale:
     """The colours of one quantity, with the name of each colour. The last colour means out of coverage.
 
-    ``key`` is the name of its styles and pictures. ``edges`` are the limits between the other colours. Values below
+    ``key`` is the name of the styles and pictures. ``edges`` are the limits between the other colours. Values below
     ``lowest`` count as out of coverage.
     """
 
@@ -195,7 +197,7 @@ def number_scale(key: str, title: str, values: AnyArray, palette: str = "viridis
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    # a few values next to a tower are far above all others and would use most colours
+    # use percentiles, because a few values next to a tower are far above all others and would take up most colours
     finite = values[np.isfinite(values)]
     low, high = np.percentile(finite, [2, 98]) if len(finite) else (0.0, 0.0)
     if centred:
@@ -212,7 +214,7 @@ def number_scale(key: str, title: str, values: AnyArray, palette: str = "viridis
 def _round_step(step: float) -> float:
     """Return a step rounded up to 1, 2 or 5 times a power of ten. A step of 0 becomes 1."""
     power = 10.0 ** np.floor(np.log10(step)) if step > 0 else 1.0
-    # with a margin, because a rounding error must not turn a step of 2 into 5
+    # add a margin, because a rounding error must not turn a step of 2 into 5
     return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
 
 
@@ -236,13 +238,13 @@ def scale_of(layer: Layer) -> Scale:
 
 
 def _picture(grid: Grid, layer: Layer, scale: Scale) -> bytes:
-    """Return a PNG with a block of pixels per cell, so that viewers that smooth it do not mix classes."""
+    """Return a PNG with a block of pixels per cell, so that viewers do not mix classes when they smooth the picture."""
     from matplotlib.colors import to_rgba_array
     from PIL import Image
 
     palette = (255 * to_rgba_array(scale.colours)).round().astype(np.uint8)
     palette[-1, 3] = 128  # the ground is visible where there is no path
-    # rows of pictures begin in the north
+    # the first row of a picture is in the north
     cells = Image.fromarray(np.ascontiguousarray(grid.raster(palette[scale.bin_of(layer.cells)])[::-1]))
     picture = cells.resize((PIXELS_PER_CELL * cells.width, PIXELS_PER_CELL * cells.height), Image.Resampling.NEAREST)
     buffer = io.BytesIO()
@@ -281,7 +283,7 @@ def maps_dataset(
     for layer in further:
         plane = first.grid.raster(layer.cells)
         if layer.classes:
-            # rank_1 instead of 1, because a number next to flag_values could be mistaken for a value
+            # write rank_1 instead of 1, because a number next to flag_values could be mistaken for a value
             codes = tuple(f"rank_{c}" if c.isdigit() else c for c in layer.classes)
             variables[layer.column] = _PLANE, plane, _codes(codes, layer.title)
         else:
@@ -292,7 +294,7 @@ def maps_dataset(
 
 
 def _text(dimension: str, names: Mapping[str, Any] | Sequence[str], meaning: str) -> _Variable:
-    # objects become strings of variable length; an array of characters would need an additional axis
+    # use objects, which become strings of variable length: an array of characters would need an additional axis
     return (dimension,), np.array(list(names), dtype=object), {"long_name": meaning}
 
 
@@ -339,7 +341,7 @@ def _levels(maps: Mapping[str, MapResult]) -> dict[str, _Variable]:
     variables = {}
     for name, (plane, meaning, unit, shown) in kinds.items():
         height = "height" if name.startswith("rss") else "height_of_rank"
-        # no level is near the limit of the ratios
+        # the limit is meant for the ratios; no level is near it
         values = {mode: np.minimum(getattr(item, plane), RATIO_LIMIT_DB) for mode, item in maps.items()}
         by_tower = [np.moveaxis(item, 1, 0) for item in values.values()]  # tower, height, n
         joint = [item.of_tower(values[mode]) for mode, item in maps.items()]
@@ -371,7 +373,8 @@ def _stacked(
     values : sequence of ndarray
         One array per mode.
     between : tuple of str
-        Dimensions of the values except the last. Without ``"tower"`` the values are those of the nearest tower.
+        Dimensions of the values except the last. If they do not include ``"tower"``, the values are those of the
+        nearest tower.
     attributes : mapping
 
     Returns

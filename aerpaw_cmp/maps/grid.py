@@ -9,8 +9,8 @@ The replay engine is passed as a function, so that this module does not depend o
     evaluate(position_m (n, 3)) -> Evaluation
 
 The function is called for one altitude and at most ``chunk`` positions at a time, so only the result grows with the
-number of altitudes. It has 24 bytes of levels, 16 bytes of singular-value ratios, and 1 byte of rank per K, for each
-tower, altitude and position.
+number of altitudes. For each tower, altitude and position, the result has 24 bytes of levels, 16 bytes of
+singular-value ratios, and 1 byte of rank per K.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from ..common.units import AnyArray, FloatArray, IntArray, Printed, db_from_powe
 from ..compare.rank import rank_from_singular_values
 from ..site.site import NEAREST
 
-# Horizontal interval d_rx of the UAV positions.
+# Horizontal interval d_rx of the UAV positions in the paper [m].
 PAPER_SPACING_M = 30.0
 
-# Limit that detects a mistyped spacing: a map of 1e8 positions would take days.
+# Limit of positions per side. It detects a mistyped spacing, because a map of 1e8 positions would take days.
 _MAXIMUM_CELLS_A_SIDE = 10_000
 
 # The arrays of the paper have four elements at each end, so no channel matrix has a higher rank.
 HIGHEST_RANK = 4
 
-# Names of the ranks 0 to 4 as classes. The first is that of a position without any path.
+# Names of the ranks 0 to 4 as classes. The first class is that of a position without any path.
 RANK_CLASSES = ("Z", "1", "2", "3", "4")
 
 
@@ -84,7 +84,7 @@ class Grid:
         east_min, east_max, north_min, north_max = area_m
         axes = []
         for low, high in ((east_min, east_max), (north_min, north_max)):
-            # 1080 / 30 must not become 35.999 cells
+            # add a margin: 1080 / 30 must not become 35.999 cells
             cells = int(np.floor(min((high - low) / spacing_m, 1e9) + 1e-9)) if spacing_m > 0 else 0
             if cells < 1:
                 raise UsageError(
@@ -140,11 +140,11 @@ class Grid:
         """Return the position index of the cell that contains each point (n, 2+). -1 outside the grid."""
         points = unmasked(points_m)
         rows, columns = self.shape
-        # a point on the border of two cells belongs to the eastern or northern one
+        # a point on the border of two cells belongs to the eastern or northern cell
         column = np.floor((points[..., 0] - self.east_m[0]) / self.spacing_m + 0.5)
         row = np.floor((points[..., 1] - self.north_m[0]) / self.spacing_m + 0.5)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        # outside the grid, row and column may be NaN, which cannot be an integer
+        # outside the grid, row and column may be NaN, which cannot be converted to an integer
         return np.where(inside, np.where(inside, row, 0) * columns + np.where(inside, column, 0), -1).astype(np.int64)
 
 
@@ -167,7 +167,7 @@ def serving_tower(points_m: ArrayLike, towers_m: ArrayLike) -> IntArray:
     if len(towers) == 0:
         raise UsageError("the site has no tower", expected="at least one tower to serve the map")
     squared = ((points[:, None, :] - towers[None, :, :]) ** 2).sum(axis=-1)
-    # round, so that the rule for ties decides and not a rounding error
+    # round, so that ties are resolved by the rule and not by rounding errors
     return np.asarray(np.argmin(np.round(squared, 6), axis=1), dtype=np.int64)
 
 
@@ -185,17 +185,17 @@ def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, floa
     Parameters
     ----------
     towers_m : (towers, 2) or (towers, 3)
-        East, north [m]. Towers at the same place have no border.
+        East, north [m]. Towers at the same position have no border.
     area_m : (east_min, east_max, north_min, north_max)
         Extent of the map [m].
 
     Returns
     -------
     tuple of Border
-        Borders of the pairs of towers that have one.
+        Borders of all pairs of towers with a common border.
     """
     towers = unmasked(towers_m)[:, :2]
-    # serving_tower assigns a shared position to the first tower there
+    # use the first of several towers at one position, as serving_tower does
     first = np.sort(np.unique(towers, axis=0, return_index=True)[1])
     west, east, south, north = area_m
     area, places = shapely.box(west, south, east, north), towers[first]
@@ -286,15 +286,15 @@ class Layer:
 
 
 def in_name(number: float, digits: int = 0) -> str:
-    """Return a height or K as part of a layer's name: 030 for 30 with three digits, 12p5 for 12.5."""
+    """Return a height or K as a part of a layer's name: 030 for 30 with three digits, 12p5 for 12.5."""
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
 
 
-# Section VII of the paper has ranks also at 3 m, to show blockage, and levels at three heights.
+# Section VII of the paper has levels at three heights. It also has ranks at 3 m, to show blockage.
 PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
 PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)
-# Positions per call. H of five towers with 4 x 4 elements then takes 2.6 MB.
+# Number of positions per call. H of five towers with 4 x 4 elements then takes 2.6 MB.
 CHUNK = 2048
 # Largest ratio of singular values that is drawn and exported. Values below 1e-9 of the largest are rounding errors.
 RATIO_LIMIT_DB = 180.0
@@ -324,7 +324,7 @@ class Evaluation:
 
     @property
     def levels(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The values that a map has at each altitude of RSS."""
+        """The levels of a map at one altitude, and their standard deviation."""
         return self.rss_siso_dbm, self.rss_mimo_dbm, self.level_sd_db
 
 
@@ -437,11 +437,11 @@ def map_job(
     at = {"rss": tuple(map(float, rss_altitudes_m)), "rank": tuple(map(float, rank_altitudes_m))}
     t, n = len(names), len(grid)
     rss = np.full((3, len(at["rss"]), t, n), np.nan)
-    # 0 is out of coverage, the value of positions that the engine does not cover
+    # start from 0, out of coverage, which remains where the engine finds no path
     rank = np.zeros((len(at["rank"]), len(ks), t, n), dtype=np.int8)
     ratio = np.full((2, len(at["rank"]), t, n), np.nan)
     for height in sorted({*at["rss"], *at["rank"]}):
-        # one height at a time, so that the memory does not depend on the number of heights
+        # evaluate one height at a time, so that the memory does not depend on the number of heights
         positions = grid.positions_m(height)
         for start in range(0, n, chunk):
             part = slice(start, min(start + chunk, n))
@@ -484,7 +484,7 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     """Return sigma_1 / sigma_2 and sigma_1 / sigma_last (2, n, t) [dB]."""
     sigma = np.nan_to_num(singular_values)
     covered = sigma[..., 0] > 0
-    # with one element at an end there is one singular value, and its ratio to itself is 1
+    # with a single element at one end, there is a single singular value, and its ratio to itself is 1
     if sigma.shape[-1] < 2:
         return np.where(covered, 0.0, np.full((2, *covered.shape), np.nan))
     # a singular value of zero has an infinite ratio, which figures and files limit to RATIO_LIMIT_DB
@@ -501,23 +501,24 @@ def _within(low: float, high: float, unit: str, name: str, cause: str, default: 
 class LinkBudget:
     """The receiver and the threshold of a coverage map.
 
-    Without a threshold a position is covered if any path arrives, which is the paper's definition.
+    Without a threshold, a position is covered if there is a path, which is the paper's definition.
 
     Parameters
     ----------
     tx_power_dbm : float
         Transmit power of a tower. The paper's 10 W are 40 dBm.
     bandwidth_mhz : float, optional
-        Receiver bandwidth B, which an SNR requires.
+        Receiver bandwidth B. It is required for an SNR.
     noise_figure_db : float
         Noise figure F of the receiver.
     threshold_dbm, threshold_snr_db : float, optional
-        Lowest level, or lowest SNR, at which a position is covered. Only one of them can be given.
+        Lowest level, or lowest SNR, at which a position is covered. Only one of the two thresholds can be given.
 
     Raises
     ------
     UsageError
-        If two thresholds are given, an SNR has no bandwidth, or the threshold is below the noise floor.
+        If both thresholds are given, a threshold of the SNR has no bandwidth, or the threshold is below the noise
+        floor.
 
     Notes
     -----

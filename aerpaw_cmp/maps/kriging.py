@@ -17,19 +17,20 @@ positions
 near-singular systems
     A system that may be near-singular is solved by an eigenvalue decomposition in the space of weights that sum to 1.
     Directions with less than 1e-10 of the largest variance are dropped. If the correlation is not a valid covariance,
-    directions with less than the most negative variance are dropped, too. In dropped directions the weights stay equal.
+    directions with less than the most negative variance are dropped, too. Along dropped directions, the weights stay
+    equal.
 out of coverage
     NaN values are ignored in each field.
 too few samples
-    If fewer than M samples are within the radius, all of them are used. A single sample is the estimate. If there is
-    no sample, the estimate and its variance are NaN, or (``outside="nearest"``) the M nearest samples are used
-    regardless of their distance.
+    If fewer than M samples are within the radius, all of them are used. If there is a single sample, its value is the
+    estimate. If there is no sample, the estimate and its variance are NaN, or (``outside="nearest"``) the M nearest
+    samples are used regardless of their distance.
 
 An interpolator may use the M nearest samples within a radius, or M random samples within the radius.
 
-The tie rule: distances that agree to a micrometre are tied. Tied samples are ordered by their offset from the target:
-lower first, then southern, then western. On a regular grid every inner target therefore has the same pattern of
-neighbours, regardless of the order of the samples.
+Ties are resolved by a rule. Distances that agree to a micrometre are tied. Tied samples are ordered by their offset
+from the target: lower first, then southern, then western. On a regular grid every inner target therefore has the same
+pattern of neighbours, regardless of the order of the samples.
 """
 
 from __future__ import annotations
@@ -47,13 +48,14 @@ from ..common.errors import UsageError, from_python
 from ..common.grouping import lists_by_key
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 
-# Targets per query, which limits the memory.
+# Number of targets per query. It limits the memory that is used.
 QUERY_CHUNK = 4096
 
-# Targets per query of all samples within a radius. It limits the memory and does not change a random draw.
+# Number of targets per query of all samples within a radius. It limits the memory, and does not affect random draws.
 AT_ONCE = 256
 
-# Distances that differ by less are tied, and a sample closer than this to a target is at its position.
+# Distances that differ by less than this are tied, and a sample closer than this to a target is at the position of the
+# target.
 TIE_M = 1e-6
 
 
@@ -64,9 +66,9 @@ class Neighbours:
     Parameters
     ----------
     index : (targets, M) int
-        Numbers of the samples; -1 after the last one.
+        Numbers of the samples; -1 after the last sample.
     distance_m : (targets, M)
-        Distances of the samples [m]; infinite after the last one.
+        Distances of the samples [m]; infinite after the last sample.
     """
 
     index: IntArray
@@ -86,7 +88,7 @@ def nearest(
     Parameters
     ----------
     samples_m : (samples, dims)
-        Distinct positions in a metric frame (anisotropy already applied).
+        Distinct positions in a frame in metres (anisotropy already applied).
     targets_m : (targets, dims)
         Positions in the same frame.
     m : int
@@ -94,7 +96,7 @@ def nearest(
     radius_m : float
         Search radius, may be infinite.
     skip : (targets,) int, optional
-        The sample that each target must not use (leave-one-out); -1 if it may use all.
+        The sample that each target must not use (leave-one-out); -1 if the target may use all samples.
 
     Returns
     -------
@@ -107,7 +109,8 @@ def nearest(
         return chosen
     tree = cKDTree(samples_m)
     for start in range(0, len(targets_m), QUERY_CHUNK):
-        # one more than required shows whether a tie continues; on the paper's grid up to 12 cells are equally distant
+        # query more samples than required, to see whether a tie continues. On the paper's grid, up to 12 cells are
+        # equally distant.
         todo, candidates = np.arange(start, min(start + QUERY_CHUNK, len(targets_m))), m + 13
         while len(todo):
             todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, candidates, chosen)
@@ -128,7 +131,7 @@ class Sampling:
 def by_rule(
     rule: Sampling | OrdinaryKriging, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None = None
 ) -> Neighbours:
-    """Return the samples of each target that a predictor uses: the nearest ones, or random ones.
+    """Return the samples that a predictor uses for each target: the nearest samples, or random samples.
 
     Parameters
     ----------
@@ -162,7 +165,8 @@ def _fill_nearest(
     """Fill the rows ``todo`` from ``candidates`` per target. Return the rows that need more candidates."""
     samples_m, m = tree.data, chosen.index.shape[1]
     candidates = min(candidates, len(samples_m))
-    # a list of ranks, because a plain 1 would drop an axis; the tree does not include the bound itself
+    # pass a list of ranks, because a plain 1 would drop an axis. Add a micrometre, because the tree excludes the bound
+    # itself.
     distance, who = tree.query(targets_m[todo], k=np.arange(1, candidates + 1), distance_upper_bound=radius_m + TIE_M)
     last = _in_micrometres(distance[:, -1])
     exhausted = (candidates == len(samples_m)) | ~np.isfinite(last)
@@ -198,7 +202,7 @@ def _tie_order(distance: FloatArray, who: IntArray, samples_m: FloatArray, targe
 def _random_within(
     rule: Sampling | OrdinaryKriging, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None
 ) -> Neighbours:
-    """Return M samples drawn without replacement within the radius, a possible reading of the paper's Step 1."""
+    """Return M samples drawn without replacement within the radius: a possible interpretation of the paper's Step 1."""
     from scipy.spatial import cKDTree
 
     m, radius_m = rule.neighbours, rule.radius_m
@@ -211,17 +215,17 @@ def _random_within(
     for start in range(0, len(targets_m), AT_ONCE):
         part = slice(start, start + AT_ONCE)
         pairs = cKDTree(targets_m[part]).sparse_distance_matrix(tree, radius_m + TIE_M, output_type="ndarray")
-        # sort the pairs, because the order of the tree may change with its version, and a draw must not
+        # sort the pairs: their order may change with the version of the tree, but a draw must not
         pairs = pairs[np.lexsort((pairs["j"], pairs["i"]))]
         target, sample, far = pairs["i"], pairs["j"], pairs["v"]
-        # one number per pair in a fixed order, so that the draw does not depend on the size of the parts
+        # draw one number per pair in a fixed order, so that the draw does not depend on the size of the parts
         draw = generator.random(len(pairs))
         if skip is not None:
             keep = sample != skip[part][target]
             target, sample, far, draw = target[keep], sample[keep], far[keep], draw[keep]
         order = np.lexsort((draw, target))
         target, sample, far = target[order], sample[order], far[order]
-        # the number of each pair among those of its target
+        # number the pairs of each target
         rank = np.arange(len(target)) - np.searchsorted(target, target)
         drawn = rank < m
         index[start + target[drawn], rank[drawn]] = sample[drawn]
@@ -232,9 +236,10 @@ def _random_within(
 # Correlation as a function of an array of distances [m].
 Correlation = Callable[[FloatArray], FloatArray]
 
-# With this condition number a solution keeps six of the sixteen digits of float64.
+# With this condition number, a solution has six of the sixteen digits of float64.
 CONDITION_LIMIT = 1e10
-# Sum of magnitudes of weights above which a warning is given. With correlations that fall steadily it is below 3.
+# Sum of magnitudes of weights above which a warning is given. With correlations that decrease steadily, the sum is
+# below 3.
 LARGEST_WEIGHTS = 100.0
 # Targets share one set of weights if the offsets of their neighbours agree to this distance [m].
 _SHARE_M = 1e-9
@@ -244,8 +249,8 @@ SOUND_CONDITION = 1e6
 # solution. Among 40 000 systems of six correlations, including samples in lines and clusters, such systems stayed below
 # 1e5.
 PLAINLY_SOUND = 3e3
-# Number of targets that may share weights and whose systems are factored together. It is smaller for systems with many
-# neighbours, so that a factor has at most the second number of elements.
+# Number of targets that may share weights and whose systems are factored together. The number is smaller for systems
+# with many neighbours, so that a factor has at most the second number of elements.
 CHUNK, FACTOR_NUMBERS = 2048, 2**20
 
 
@@ -256,9 +261,9 @@ class Weights:
     Parameters
     ----------
     index : (targets, M) int
-        Numbers of the positions used; -1 after the last one.
+        Numbers of the positions that are used; -1 after the last position.
     weight : (targets, M)
-        Weights, which sum to 1 for a target with samples; 0 after the last one.
+        Weights; 0 after the last sample. They sum to 1 for a target with samples.
     variance : (targets,)
         Kriging variance for ``v^2 = 1``; NaN if there is no sample.
     regularised : (targets,) bool
@@ -288,7 +293,8 @@ class OrdinaryKriging:
     radius_m : float
         r0, the search radius [m]. It may be infinite.
     selection : {"nearest", "random"}
-        The M nearest (ties by the rule of :mod:`~aerpaw_cmp.maps.kriging`), or M drawn within the radius.
+        The M nearest samples (ties by the rule of :mod:`~aerpaw_cmp.maps.kriging`), or M random samples within the
+        radius.
     seed : int
         Seed of the random selection.
     outside : {"nan", "nearest"}
@@ -310,8 +316,8 @@ class OrdinaryKriging:
     Notes
     -----
     Weights can be negative, so an estimate can lie outside the range of its samples. The effect is largest for a
-    correlation that is smooth at 0: from ranks 1 and 4 a Gaussian correlation produced -6.9 to 11.3. ``bounds`` limits
-    the estimates.
+    correlation that is smooth at 0: with a Gaussian correlation, estimates from ranks 1 and 4 were -6.9 to 11.3.
+    ``bounds`` limits the estimates.
 
     Examples
     --------
@@ -355,13 +361,13 @@ class OrdinaryKriging:
         # estimates are returned in the shape of the values
         self._shape = fields.shape[1:]
         self.points_m_, self.values_, self.place_ = _merge_places(points, as_table(fields))
-        # subtract one value of the field, so that a constant field has a variance of exactly 0
+        # subtract a value of the field, so that a constant field has a variance of exactly 0
         centred = np.ma.masked_invalid(self.values_ - _reference(self.values_))
         self.sill_ = np.ma.filled(centred.var(axis=0, ddof=1), 0.0)
         return self
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and Kriging variance at targets (t, dims), both (t,) or (t, fields) like the values."""
+        """Return estimate and Kriging variance at targets (t, dims), both (t,) or (t, fields) as for the values."""
         targets = _as_points(targets_m)
         if targets.shape[1] != self.points_m_.shape[1]:
             raise UsageError(f"targets with {targets.shape[1]} coordinates, samples with {self.points_m_.shape[1]}")
@@ -403,7 +409,7 @@ class OrdinaryKriging:
         """Return estimate and variance (targets, fields). ``place`` is the position that each target must not use."""
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         variance = np.full_like(estimate, np.nan)
-        # fields with values at the same positions share one set of weights, like the 27 ranks of a map
+        # use one set of weights for all fields with values at the same positions, such as the 27 ranks of a map
         for covered, columns in coverage_patterns(self.values_):
             skip = None if place is None else renumbered(covered)[place]
             rule = self._weights(self.points_m_[covered], targets, skip)
@@ -430,7 +436,7 @@ class OrdinaryKriging:
             step = min(CHUNK, max(1, FACTOR_NUMBERS // int(m) ** 2))
             for start in range(0, len(same), step):
                 rows = same[start : start + step]
-                # targets are on the last axis, so that each operation runs along many systems at once
+                # put targets on the last axis, so that each operation runs over many systems at once
                 near = np.ascontiguousarray(chosen.index[rows, :m].T)
                 offset = coordinates[:, near]
                 offset -= targets[rows].T[:, None]
@@ -458,7 +464,7 @@ class OrdinaryKriging:
         gamma = 1.0 - np.asarray(self.correlation(np.sqrt(square)), dtype=np.float64)
         if not np.isfinite(gamma).all():
             raise UsageError("the correlation is not finite at some distance", expected="a number at every distance")
-        # rounding, or the function of a user, may exceed a correlation of 1
+        # a correlation may exceed 1, by rounding or in a function of the user
         return np.asarray(np.maximum(gamma, 0.0))
 
     def _solve(
@@ -479,7 +485,7 @@ class OrdinaryKriging:
             weight[:, hard] = w.T
         # next to a sample the variance is nearly 0, and rounding can make it negative
         variance = np.maximum(variance, 0.0)
-        at = here.any(axis=0)  # the exact solution is known, and rounding must not change it
+        at = here.any(axis=0)  # the exact solution at a sample is known
         weight[:, at], variance[at] = here[:, at], 0.0
         return weight, variance, regularised
 
@@ -493,7 +499,7 @@ def _square(pairs: FloatArray, m: int) -> FloatArray:
 
 
 def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return weights (m, t), variance (t,) and whether both are reliable, for the covariance ``1 - gamma``.
+    """Return weights (m, t), variance (t,) and whether the solution is reliable, for the covariance ``1 - gamma``.
 
     Parameters
     ----------
@@ -509,7 +515,8 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
     the condition number of C by ``m trace``. The trace is computed only if the pivots do not exclude a large bound.
     """
     m, t = to_target.shape
-    # store by columns, so that a step adds contiguous planes of memory; the two additional rows are L^-1 c and L^-1 1
+    # store by columns, so that each step adds contiguous planes of memory. The two additional rows are L^-1 c and L^-1
+    # 1.
     factor, weight, inverse_pivot = np.empty((m, m + 2, t)), np.empty((m, t)), np.empty((m, t))
     # a slice of ``gamma`` is one column of the lower triangle of the matrix
     end = 0
@@ -530,7 +537,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
         for j in reversed(range(m)):
             weight[j] = known[j] - np.einsum("it,it->t", factor[j, j + 1 : m], weight[j + 1 :])
             weight[j] *= inverse_pivot[j]
-        # weights sum to 1 by construction: remove rounding errors
+        # weights sum to 1 by construction, so remove rounding errors
         weight /= weight.sum(axis=0)
         sound = m * (inverse_pivot**2).sum(axis=0) < PLAINLY_SOUND
         if len(unclear := np.flatnonzero(~sound)):
@@ -562,7 +569,8 @@ def _solve_doubtful(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArra
     covariance = -basis @ gamma @ basis.T
     right = basis @ (gamma.mean(axis=2) - to_target)[:, :, None]
     level, direction = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
-    # a direction weaker than the most negative one, which is an impossible variance, may be only rounding error
+    # a negative eigenvalue is an impossible variance: directions with smaller positive eigenvalues may be only rounding
+    # errors
     strong = level > np.maximum(np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT, -level[:, :1])
     along = (direction.transpose(0, 2, 1) @ right)[:, :, 0]
     along = np.where(strong, along / np.where(strong, level, 1.0), 0.0)
@@ -605,7 +613,7 @@ def as_table(values: FloatArray) -> FloatArray:
 
 
 def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:
-    """Yield groups of fields with values at the same positions: mask of the positions, numbers of the fields."""
+    """Yield groups of fields with values at the same positions: mask of the positions, and numbers of the fields."""
     finite = np.isfinite(values.T) if values.size else ()
     # np.unique along an axis takes ten times as long
     patterns = lists_by_key((covered.tobytes(), number) for number, covered in enumerate(finite))
@@ -623,7 +631,7 @@ def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, F
     place = rank[place.ravel()]
     if len(first) == len(points):
         return points, fields, place
-    # sums relative to one sample of the position, so that equal values have exactly the same mean
+    # sum differences from one sample of the position, so that the mean of equal values is exact
     base = fields[first[order]]
     base = np.where(np.isfinite(base), base, 0.0)
     finite = np.isfinite(fields)
@@ -639,14 +647,14 @@ def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | s
     t = offset_m.shape[2]
     alone = slice(None), slice(None)
     if len(np.unique(np.round(offset_m[:, 0].sum(axis=0) / TIE_M))) == t:
-        return alone  # scattered samples, which this test detects in a tenth of the time
-    # integers compare exactly, and a nanometre covers the rounding of coordinates of kilometres
+        return alone  # scattered samples: this test is ten times faster
+    # compare integers of a nanometre, which is more than the rounding error of coordinates of kilometres
     offset = np.round(offset_m.reshape(-1, t) / _SHARE_M).astype(np.int64)
     # the sum of the offsets with random odd factors, modulo 2^64, identifies a target
     factors = np.random.default_rng(0).integers(1, 2**62, len(offset), dtype=np.int64) | 1
     _, example, group = np.unique(factors @ offset, return_index=True, return_inverse=True)
     if not (offset[:, example[group]] == offset).all():
-        return alone  # two different targets have one number: share nothing, which does not change the result
+        return alone  # a hash collision: share nothing
     return example, group
 
 
@@ -659,7 +667,7 @@ def _as_points(points_m: ArrayLike) -> FloatArray:
     return points
 
 
-# Fewest samples from which a factor of the trend can be distinguished from a constant.
+# Smallest number of samples with which a factor of the trend can be distinguished from a constant.
 _FEWEST_FOR_TREND = 3
 
 
@@ -675,7 +683,8 @@ class TrendKriging:
     correlation : callable
         Phi(distance [m]) of the residual.
     neighbours, radius_m : int, float
-        The same as in :class:`OrdinaryKriging`. With fewer than three samples in the radius the nearest are used.
+        The same as in :class:`OrdinaryKriging`. With fewer than three samples within the radius, the nearest samples
+        are used.
     bounds : (low, high), optional
         Limits of the estimates, such as (1, 4) for ranks.
 
@@ -705,7 +714,7 @@ class TrendKriging:
         Raises
         ------
         UsageError
-            If the shapes differ, or no sample has both.
+            If the shapes differ, or no sample has both values.
         """
         points, value, known = _as_points(points_m), unmasked(values), unmasked(trend)
         if not value.shape == known.shape == (len(points),):
@@ -724,7 +733,7 @@ class TrendKriging:
         return self
 
     def predict(self, targets_m: ArrayLike, trend: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and Kriging variance (t,) at targets (t, dims) with their trend (t,). NaN without a trend."""
+        """Return estimate and Kriging variance (t,) at targets (t, dims) with a trend (t,). NaN if the trend is NaN."""
         targets, wanted = _as_points(targets_m), unmasked(trend)
         if wanted.shape != (len(targets),):
             raise UsageError(f"trend of shape {wanted.shape} for {len(targets)} targets", expected="(t,)")
@@ -742,7 +751,7 @@ class TrendKriging:
         points, f = self.points_m_[used], self.trend_[used]
         conditions, aim = [np.ones(len(used))], [1.0]
         if len(used) >= _FEWEST_FOR_TREND and np.ptp(f) > 1e-6 * max(float(np.abs(f).max()), 1.0):
-            # scale the conditions equally, because a trend of -100 dBm next to ones makes the system ill-conditioned
+            # scale the trend, because values of -100 dBm next to ones would make the system ill-conditioned
             scale = float(np.ptp(f))
             conditions, aim = [*conditions, (f - f.mean()) / scale], [*aim, (trend - float(f.mean())) / scale]
         n, extra = len(used), len(conditions)

@@ -1,18 +1,18 @@
-"""Tiles of a map: what can reach each tile, a file for each finished tile, and a Zarr store of all tiles.
+"""Tiles of a map: towers and buildings that can reach a tile, a file per finished tile, and a Zarr store of all.
 
-A killed run loses only the tiles that were being computed; the same command computes them and continues. A tile file
-contains its SHA-256, the number of paths, and the planes of :data:`PLANES` as 32-bit floats, and nothing that could run
-code. A tile whose file has a different length or digest is computed again.
+A killed run loses only the tiles that were being computed. The same command then computes these and all remaining
+tiles. A tile file contains its SHA-256, the number of paths, and the planes of :data:`PLANES` as 32-bit floats. It
+cannot contain executable code. A tile whose file has a different length or digest is computed again.
 
 A tile is evaluated with the towers and buildings that can reach it. With at most one reflection over level ground, a
-path seen from above is the line between its ends, or two lines from a tower to a wall and on to the tile. No relevant
-building is therefore omitted if a building counts that comes near
+path seen from above is the line between its ends, or two lines from a tower to a wall and on to the tile. Therefore, no
+relevant building is omitted if all buildings are used that touch
 
 - the convex hull of tower and tile (which also contains the reflections off ground and roofs), or
 - the hull of tower and wall, or the hull of wall and tile, for each wall whose beam from the mirrored tower may reach
   the tile.
 
-With more reflections, terrain or a scene of triangles, every building counts.
+With more reflections, terrain or a scene of triangles, all buildings are used.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from ..site.site import Site, Tower
 from .export import maps_dataset
 from .grid import Grid, MapResult, serving_tower, voronoi_borders
 
-# A building within this distance of a hull counts [m]. It is far above rounding errors.
+# A building within this distance of a hull is used [m]. The distance is far larger than rounding errors.
 NEAR_M = 0.01
 
 # Largest level above free space [dB]: that of ten paths in phase, each as strong as the direct path.
@@ -55,7 +55,7 @@ PLANES = ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "c
 
 @dataclass(frozen=True, slots=True)
 class Tiling:
-    """A grid in square tiles with ``cells`` positions per side, numbered like positions. The last can be smaller."""
+    """A grid in square tiles with ``cells`` positions per side, numbered like positions. The last may be smaller."""
 
     grid: Grid
     cells: int
@@ -70,7 +70,7 @@ class Tiling:
         return self.shape[0] * self.shape[1]
 
     def part(self, number: int) -> tuple[slice, slice]:
-        """Return the rows and columns of the grid that are one tile."""
+        """Return the rows and columns of the grid that belong to one tile."""
         row, column = divmod(number, self.shape[1])
         rows, columns = self.grid.shape
         return (
@@ -93,7 +93,7 @@ class Tiling:
         tiles : iterable of (mapping of str to MapResult, int)
             Maps by foliage mode and number of paths of each tile, in the order of the tiles.
         step : int
-            The maps contain every ``step``-th position along either axis. The paths of all positions count.
+            The maps contain every ``step``-th position along either axis. The paths to all positions are counted.
         """
         grid = Grid(self.grid.east_m[::step], self.grid.north_m[::step], self.grid.spacing_m * step)
         rasters: dict[tuple[str, str], AnyArray] = {}
@@ -154,14 +154,14 @@ class Reach:
         places = [tower.position_m[:2] for tower in site.towers.values()]
         spans = (site.area_m, np.ravel(places), shapely.bounds(footprints).ravel())
         farthest = np.nanmax(np.abs(np.concatenate(spans)))
-        # corners (2, 3) of a box around the site in any rotation, which sets equal tolerances for all tiles
+        # corners (2, 3) of a box around the site in any rotation. It sets equal tolerances for all tiles.
         self.extent_m = np.sqrt(2.0) * farthest * np.array([[-1.0] * 3, [1.0] * 3])
         if self._every:
             return
         faces = site_faces(site)
         bounds = shapely.bounds(footprints) + NEAR_M * np.array([-1.0, -1.0, 1.0, 1.0])
         self._near = shapely.STRtree(shapely.box(*bounds.T))
-        self._ends = corners(faces, 1e9)[:, :2, :2]  # ends of the lower edge of each wall, seen from above
+        self._ends = corners(faces, 1e9)[:, :2, :2]  # plan view: the ends of each wall's lower edge
         self._is_wall = (faces.solid >= 0) & (faces.normal[:, 2] == 0.0)
         self._growth = Growth.of(faces, self.extent_m, REACH_SLACK_M, max_depth=1, budget=len(faces) + 1)
 
@@ -214,7 +214,7 @@ class TileStore:
     Parameters
     ----------
     folder : Path
-        Created with the first tile. Files that are not tiles are neither read nor removed.
+        Folder, which is created with the first tile. Files that are not tiles are neither read nor removed.
     tiling : Tiling
     job : mapping
         All inputs of the values, as JSON values. Tiles of a different job are not used.
@@ -326,7 +326,7 @@ class TileStore:
         chunks, tile = {}, np.minimum(self.tiling.cells, grid.shape).tolist()
         for name in planes:
             (*leading, _, _), kind = like[name].shape, like[name].dtype
-            # one number in the shape of the plane, which takes no memory; its chunks are not written
+            # a broadcast number, which needs no memory. Its chunks are not written.
             fill = np.array(np.nan if kind.kind == "f" else 0, dtype=kind)
             store[name] = like[name].dims, np.broadcast_to(fill, (*leading, *grid.shape)), like[name].attrs
             chunks[name] = {"chunks": (*leading, *tile), "fill_value": fill.item(), "_FillValue": None}

@@ -2,16 +2,17 @@
 
 Two correlations are averaged over pairs of positions in bins of distance:
 
-- :func:`vector_correlation` is that of the paper (arXiv 2502.10324, section VI-A): the Pearson correlation of the
+- :func:`vector_correlation` is the correlation of the paper (arXiv 2502.10324, section VI-A): the Pearson correlation
+of the
   vectors of two positions, which contain the ranks of all altitudes and K. It mixes horizontal and vertical changes.
 - :func:`field_correlation` is horizontal: each field (one altitude, one K) is standardised over the positions, and the
   values of two positions are multiplied.
 
-Both can be used for RSS and rank. NaN is out of coverage. The caller decides whether a rank of 0 is a number or
-NaN.
+Both can be used for RSS and rank. NaN means out of coverage. The caller decides whether a rank of 0 is used as a number
+or is NaN.
 
 Bins follow the paper. Bin ``n`` contains the pairs whose distance is nearest to ``n`` times the width; half-way values
-go up. Bin 0 contains each position with itself, where the correlation is 1 by definition.
+are rounded up. Bin 0 contains each position with itself, where the correlation is 1 by definition.
 
 :func:`fit_biexponential` fits the paper's curve by variable projection.
 """
@@ -45,10 +46,10 @@ class BiExponential:
     rmse : float
         Root mean square residual of the fit.
     degenerate : bool
-        True if the data do not determine two exponentials. The curve is still the best one, but its coefficients are
-        not reliable.
+        True if the data do not determine two exponentials. The curve still has the smallest error, but its coefficients
+        are not reliable.
     message : str
-        The reasons if ``degenerate``, otherwise empty.
+        Reasons why the curve is ``degenerate``, otherwise empty.
 
     Examples
     --------
@@ -145,7 +146,7 @@ class _Projection:
             raise UsageError(
                 f"{counted(len(d), 'usable point')} for a curve", expected="at least two, at different distances"
             )
-        # the slowest exponential is constant over the data, and the fastest has vanished at the first bin
+        # the slowest exponential is constant over the data, and the fastest is zero at the first bin
         slow, fast = 1e-6 / d.max(), 10.0 / d[d > 0].min()
         return cls(d, y, (float(np.log(slow)), float(np.log(fast))))
 
@@ -186,7 +187,7 @@ class _Projection:
         return np.asarray(fit.x)
 
     def single_rates(self) -> FloatArray:
-        """Return the logarithm of the rate of the best single exponential twice: the best of 200, refined."""
+        """Return the logarithm of the rate of the best single exponential, twice. The best of 200 rates is refined."""
         from scipy.optimize import minimize_scalar
 
         axis = np.linspace(*self.log_rates, 200)
@@ -207,7 +208,7 @@ class _Projection:
         refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(self.cost(grid))[:STARTS]])
         log_rates = np.sort(self._search(refined[np.argmin(self.cost(refined))], 1e-15))[::-1]
         (c1, c3), n = self.amplitudes(log_rates)[0], len(self.d)
-        # if both curves are exact, the ratio must be 1 and not 0 / 0
+        # add a little: if both curves are exact, the ratio must be 1 and not 0 / 0
         scale = 1e-20 * float((self.y**2).sum())
         ratio = (self.cost(self.single_rates()) + scale) / (self.cost(log_rates) + scale)
         at_end = log_rates[0] > self.log_rates[1] - 1e-3
@@ -216,7 +217,7 @@ class _Projection:
             # Bayesian information criterion with a penalty for two more coefficients
             "one exponential fits as well": n * np.log(ratio) - 2 * np.log(n) <= 0,
             "one of the two exponentials has no amplitude": min(c1, c3) <= 1e-3 * max(c1, c3),
-            # two rates within 5 % represent a single exponential
+            # two rates within 5 % are in effect a single exponential
             "both exponentials decay at the same rate": log_rates[0] - log_rates[1] < 0.05,
             "the faster decay ends before the first distance, so its rate cannot be determined": at_end,
             "the slower decay does not show within the largest distance": flat,
@@ -251,14 +252,14 @@ def _clipped(right: FloatArray, square: FloatArray) -> FloatArray:
     return np.asarray(np.clip(right / np.maximum(square, TINY), 0.0, 1.0))
 
 
-# Positions per block of pairs. The memory is BLOCK times the number of positions.
+# Number of positions per block of pairs. The memory is proportional to BLOCK times the number of positions.
 BLOCK = 256
 
 # Bins are as wide as d_rx (section VI-A), and distances reach 500 m (section VII-C).
 _PAPER_WIDTH_M = 30.0
 _PAPER_MAXIMUM_M = 500.0
-# Smallest number of components that both positions of a pair must have. With two, the correlation would always be +1
-# or -1.
+# Smallest number of components that both positions of a pair must have. With two components, the correlation would
+# always be +1 or -1.
 _MINIMUM_COMMON = 3
 
 
@@ -406,7 +407,7 @@ class Variogram:
         """
         self.binned_ = field_correlation(points_m, values, width_m=self.width_m, maximum_m=self.maximum_m)
         pairs = np.isfinite(self.binned_.correlation)
-        # fit at the mean distance of the pairs, which may be a fifth of the width from the middle of the bin
+        # fit at the mean distance of the pairs, which may differ from the middle of the bin by a fifth of its width
         self.model_ = fit_biexponential(self.binned_.mean_distance_m[pairs], self.binned_.correlation[pairs])
         return self
 
@@ -431,10 +432,10 @@ def _pairwise_pearson(data: FloatArray) -> Block:
         sum_x, sum_y = x @ theirs, mine @ y
         square_x, square_y = square[rows] @ theirs, mine @ square[columns].T
         vary_x, vary_y = square_x - sum_x**2 / safe, square_y - sum_y**2 / safe
-        # a smaller variance is the rounding error of the difference
+        # a smaller variance is only a rounding error of the difference
         good = (n >= _MINIMUM_COMMON) & (vary_x > 1e-12 * square_x) & (vary_y > 1e-12 * square_y)
         scale = np.sqrt(np.where(good, vary_x * vary_y, 1.0))
-        # rounding can bring the correlation of equal vectors above 1
+        # rounding can make the correlation of equal vectors exceed 1
         return np.where(good, np.clip((x @ y - sum_x * sum_y / safe) / scale, -1.0, 1.0), np.nan)
 
     return of
@@ -453,7 +454,7 @@ def _mean_product(scaled: FloatArray, present: BoolArray) -> Block:
 
 def _sums(distance_m: FloatArray, value: FloatArray, width_m: float, bins: int) -> FloatArray:
     """Return sums of distances and values, and numbers of pairs, per bin of distance, shape (3, bins)."""
-    # a grid distance such as sqrt(2) * 30 must not change its bin by rounding
+    # round first: a grid distance such as sqrt(2) * 30 must not change its bin by rounding errors
     number = np.floor(np.round(distance_m / width_m, 9) + 0.5).astype(np.int64)
     good = (number < bins) & np.isfinite(value)
     weights = distance_m[good], value[good], np.ones(int(good.sum()))
@@ -467,7 +468,7 @@ def _bin_pairs(
     if not (width_m > 0 and maximum_m >= width_m and np.isfinite(maximum_m)):
         raise UsageError(f"bins of {width_m} m up to {maximum_m} m", expected="0 < width <= maximum, both finite")
     sums = np.zeros((3, int(np.floor(maximum_m / width_m + 1e-9)) + 1))
-    # the last bin ends half a width beyond its centre; a micrometre more includes pairs at exactly this distance
+    # the last bin ends half a width beyond its centre. Add a micrometre to include pairs at exactly this distance.
     reach = min(maximum_m, width_m * (sums.shape[1] - 0.5)) + 1e-6
     for rows, columns in _blocks_within(points, reach):
         distance = np.hypot(
@@ -487,7 +488,7 @@ def _blocks_within(points: FloatArray, reach_m: float) -> Iterator[tuple[IntArra
     north = points[order, 1]
     for start in range(0, len(order), BLOCK):
         rows = order[start : start + BLOCK]
-        # the rows of a block are adjacent in north, so their columns are contiguous
+        # the rows of a block are sorted by north, so their columns are contiguous
         low = np.searchsorted(north, points[rows, 1].min() - reach_m)
         high = np.searchsorted(north, points[rows, 1].max() + reach_m, side="right")
         yield rows, order[low:high]

@@ -222,9 +222,9 @@ def level_track(
     ----------
     time_s : (n,)
     position_m : (n, 3)
-        NaN if it is not known.
+        Positions of the UAV [m]; NaN if unknown.
     level_db : (n,)
-        NaN is ignored.
+        Levels [dB]. NaN is ignored.
     floor_db : float
 
     Returns

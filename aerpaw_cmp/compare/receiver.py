@@ -538,7 +538,7 @@ class ReceiverMixture:
     Parameters
     ----------
     members : tuple of Receiver
-        One per geometry, best first.
+        One receiver per geometry, best first.
     decision_weight : (ranks,)
         The decided rank has the largest product of mean probability and weight. With ones, it is the most probable
         rank. Other weights maximise kappa on held-out sectors of the training flights (:func:`decision_weights`).

@@ -212,7 +212,7 @@ def export_scene(site: Site, folder: str | Path) -> list[Path]:
     site : Site
         East is x, north is y, up is z. Trees are omitted, because Sionna treats crowns as slabs and mirrors.
     folder : str or Path
-        Created if missing. Files of the same names are replaced.
+        Folder, which is created if missing. Files of the same names are replaced.
 
     Returns
     -------

@@ -28,7 +28,7 @@ def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]
     Parameters
     ----------
     times : array of datetime64
-        UTC.
+        Times in UTC.
     timezone : str
         IANA zone of the simulated clock.
     digits : int

@@ -1,13 +1,13 @@
-"""Compiled code of the path search among thousands of faces: options of its kernels, its folder, and threads.
+"""Compiled code of the path search among thousands of faces: options of kernels, folder of the code, and threads.
 
 numba is optional (extra ``fast``). Importing numba and reading compiled code takes about a second, and compiling takes
 ten to thirty seconds, once per machine. NumPy finds the same paths among few faces in about the same time, so compiled
 code is used only for more faces (:func:`aerpaw_cmp.propagation.engines.by_beams`).
-``AERPAW_CMP_COMPILED=never`` switches it off.
+``AERPAW_CMP_COMPILED=never`` switches compiled code off.
 
-numba's cache on disk notices only changes in the file of a kernel. Formulas and constants that a kernel imports from
-another file would stay as they were compiled. The folder name therefore contains a hash of every source of compiled
-code.
+numba's cache on disk notices only changes in the file of a kernel. If a formula or constant changes in another file
+that a kernel imports, the old compiled code would still be used. The name of the folder therefore contains a hash of
+every source of compiled code.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SOURCES = (
 )  # fmt: skip
 
 _MARK = b"aerpaw-cmp kernel 1\n"
-# The same as in NumPy: 1 / 0 is infinite, not an exception. Sums are not reordered, because the last bits would differ.
+# As in NumPy, 1 / 0 is infinite and not an exception. Sums are not reordered, because the last bits would differ.
 _MATHS: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 
 
@@ -48,7 +48,7 @@ def is_allowed() -> bool:
     Raises
     ------
     UsageError
-        If the value is not known.
+        If the variable has an unknown value.
     """
     value = os.environ.get(SWITCH, "auto").strip().lower() or "auto"
     if value not in ("auto", "never"):
@@ -57,7 +57,7 @@ def is_allowed() -> bool:
 
 
 def _source_hash() -> str:
-    """Return the hash of the sources, of numba's version and of Python's."""
+    """Return the hash of the sources and of the versions of numba and Python."""
     # machine code depends on the versions of numba and Python
     digest = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
     for name in SOURCES:
@@ -69,7 +69,7 @@ def _source_hash() -> str:
 def code_folder() -> Path | None:
     """Return the private folder of compiled code, or None if no folder can be used.
 
-    It is in ``NUMBA_CACHE_DIR``, the package or the user's cache.
+    The folder is in ``NUMBA_CACHE_DIR``, the package or the user's cache.
     """
     named = os.environ.get("NUMBA_CACHE_DIR")
     for base in (Path(named),) if named else (ROOM / "__pycache__", cache_folder("compiled")):
@@ -77,10 +77,10 @@ def code_folder() -> Path | None:
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             status = folder.stat()
-            # other users could leave code for us to run in a folder that they can write to
+            # refuse a folder that other users can write to: they could leave code there that this process would run
             if hasattr(os, "geteuid") and (status.st_uid != os.geteuid() or status.st_mode & 0o022):
                 continue
-            # try to write, because no other test covers rights, quotas and read-only mounts
+            # try to write, because no other test covers permissions, quotas and read-only mounts
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
@@ -102,7 +102,7 @@ def _failure() -> str:
     """
     if find_spec("numba") is None:
         return "numba is not installed (pip install 'aerpaw-cmp[fast]')"
-    if os.path.lexists(".numba_config.yaml"):  # a third party may have made it, and it can make numba write files
+    if os.path.lexists(".numba_config.yaml"):  # such a file can make numba write files
         return "the working folder contains a .numba_config.yaml, which numba would obey"
     try:
         with warnings.catch_warnings():
@@ -117,12 +117,12 @@ def _failure() -> str:
 
 @lru_cache(maxsize=1)
 def warn_once(reason: str) -> None:
-    """Warn that compiled code cannot run, and why."""
+    """Warn that compiled code cannot run, with the reason."""
     warnings.warn(f"{reason}: the job runs in NumPy, up to ten times slower", RuntimeWarning, stacklevel=4)
 
 
 def thread_count() -> int:
-    """Return the number of cores that this process may use, fewer than the machine's in a container or taskset."""
+    """Return the number of cores that this process may use. A container or taskset may limit it."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # this function does not exist on macOS and Windows
@@ -134,7 +134,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     import numba
     from numba.core import config
 
-    options = options or {"_nrt": True}  # set the option explicitly: otherwise that of the first caller would be used
+    options = options or {"_nrt": True}  # explicit, else the first caller's option would apply
     compiled = numba.njit(nogil=True, **_MATHS, **options)(function)
     if (folder := code_folder()) is not None:
         before = config.CACHE_DIR
@@ -149,7 +149,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
 
 
 class _Sealed:
-    """The compiled code of one kernel on disk. Damaged files of numba itself can crash the process.
+    """The compiled code of one kernel on disk. It is sealed: a damaged file of numba's cache can crash the process.
 
     An entry is followed by its SHA-256. A damaged entry is ignored, and the kernel is compiled again. Only this user
     can write to the folder (:func:`code_folder`), since an entry contains machine code.
@@ -160,11 +160,11 @@ class _Sealed:
         self._name = f"{function.__module__}.{function.__qualname__}"
 
     def _place(self, key: Any) -> Path:
-        # hashed: a signature of records is longer than a file name may be
+        # use a hash, because the signature of a record is too long for a file name
         return self._folder / f"{self._name}-{sha256(repr(key).encode()).hexdigest()[:32]}.kernel"
 
     def load(self, key: Any) -> Any:
-        """Return the compiled code of a signature. None if it is not stored."""
+        """Return the compiled code for a signature. None if it is not stored."""
         try:
             content = read_sealed(self._place(key), _MARK)
         except ValueError:
@@ -172,16 +172,16 @@ class _Sealed:
         return None if content is None else pickle.loads(content)
 
     def save(self, key: Any, data: Any) -> None:
-        """Store the compiled code of a signature."""
+        """Store the compiled code for a signature."""
         from numba.core.serialize import dumps
 
         write_sealed(self._place(key), dumps(data), _MARK)
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Compile a function that kernels call and that creates no array.
+    """Compile a function that kernels call and that does not create an array.
 
-    Reference counts of the arrays in its records would be updated at each call, which took four fifths of the time of a
-    search. The caller keeps the arrays alive, so such a function does not count references (numba's ``_nrt``).
+    Updating the reference counts of its arrays at each call took four fifths of the time of a search. The caller keeps
+    the arrays alive, so reference counting is switched off for the function (numba's ``_nrt``).
     """
     return kernel(function, forceinline=True, _nrt=False)

@@ -1,22 +1,22 @@
 """Replays in parts, replays of a tower that moves, and channels of many antenna geometries.
 
-A long flight is replayed in parts of its poses, which bounds the memory.
+A long flight is replayed in parts, which limits the memory.
 
 A tower that moves is a rover or a second UAV with a separate position at every pose. Every position of the node is a
 separate source, so there is no approximation. The poses are processed in blocks of a few positions. Each position is a
-tower that has links only to its poses. Poses at the same position share a tower, so a node that does not move is
-replayed exactly as a fixed tower.
+tower that has links only to the poses at that position. Poses at the same position share a tower, so a node that does
+not move is replayed exactly as a fixed tower.
 
 Channels of many antenna geometries are computed at once, for line of sight and ground reflection. The orientation of a
 modem's antennas and the slants of its ports are rarely documented. Thousands of geometries can be tried without a
-replay for each. The field of an element slanted by ``s`` is ``cos s`` times that of a vertical element plus ``sin s``
-times that of a horizontal element at the same position. One evaluation with both at every port
-(:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) therefore serves all slants.
-The ground reflection is one ray, which can be added at any strength.
+separate replay for each geometry. The field of an element slanted by ``s`` is ``cos s`` times that of a vertical
+element plus ``sin s`` times that of a horizontal element at the same position. Therefore, one evaluation with both
+elements at every port (:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) is
+enough for all slants. The ground reflection is one ray, which can be added at any strength.
 
-The rank that a modem reports is for its whole band. If the ground ray is 3 m longer than the direct ray, their phase
-difference turns by about one cycle over 100 MHz. In addition to the coherent sum at the carrier there is therefore the
-power sum ``L L^H + g^2 G G^H`` over the receiving ports. Its eigenvalues are the mean squared singular values.
+The rank that a modem reports is for its complete band. If the ground ray is 3 m longer than the direct ray, their phase
+difference changes by about one cycle over 100 MHz. Instead of the coherent sum at the carrier, the power sum ``L L^H +
+g^2 G G^H`` over the receiving ports can therefore be used. Its eigenvalues are the mean squared singular values.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .search.terrain import TERRAIN
 def replay_in_parts(
     site: Site, link: Link, poses: Poses, search: Search, field: Field, run: Run, *, size: int
 ) -> Replay:
-    """Replay at most ``size`` poses at once.
+    """Replay a flight in parts of at most ``size`` poses.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ def replay_in_parts(
     Returns
     -------
     Replay
-        The replay of all poses, as if they were replayed at once.
+        The replay of all poses, the same as without parts.
     """
     rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
     if len(rows) == 1:
         return replay(site, link, poses, search, field, run)
-    # Do not pass the callback on: each part would report its own progress from 0 to 1.
+    # Do not pass the callback on, because each part would report its own progress from 0 to 1.
     progress, run = run.progress, replace(run, progress=None, extent_m=extent_of(poses.position_m))
 
     def of(at: IntArray) -> Replay:
@@ -82,7 +82,7 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
         if progress is not None:
             progress(finished / count)
     first = replays[0]
-    # terrain planes are numbered in order of first use, so the same number is another plane in each part
+    # terrain planes are numbered in order of first use, so one number means different planes in the parts
     faces, shifted = _joined_faces(replays)
     pieces = [shifted, *zip(*(part.further for part in replays), strict=True)]
     further: dict[str, Any] = {
@@ -95,7 +95,7 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
     columns = {name: [getattr(part, name) for part in replays] for name in PER_LINK}
     replays.clear()
     arrays: dict[str, Any] = {}
-    # join one array at a time and free its parts, so that the peak memory is only one array above the result
+    # join one array at a time and free its parts, so that the peak memory exceeds the result by only one array
     for name in PER_LINK:
         values = columns.pop(name)
         arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
@@ -113,7 +113,7 @@ def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
 
 
 def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
-    """Return the faces of all parts, shared ones only once, and the path set of each part with their new numbers."""
+    """Return the faces of all parts without duplicates, and the path set of each part with the new face numbers."""
     # all parts begin with the faces of the site; planes of the terrain follow
     common = int((parts[0].faces.solid != TERRAIN).sum())
     if all(len(part.faces) == common for part in parts):
@@ -128,7 +128,7 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
 
 
 def added_up(omissions: Iterable[Omission]) -> list[Omission]:
-    """Return the omissions of all parts of a replay, each once, with their counts added up."""
+    """Return the omissions of all parts of a replay without duplicates, with their counts added up."""
     added: dict[tuple[str, str], Omission] = {}
     for item in omissions:
         key = item.tower, item.what
@@ -139,7 +139,7 @@ def added_up(omissions: Iterable[Omission]) -> list[Omission]:
 
 
 # Largest number of node positions per block. H of a block has a tower for each position, although a pose uses only one
-# of them.
+# of these towers.
 PLACES_AT_ONCE = 64
 
 # Largest number of links (poses times positions) per block: about 4 MB of H with 4 x 4 elements.
@@ -150,7 +150,7 @@ LINKS_AT_ONCE = 16_384
 class _Block:
     """Some poses (rows of the flight) and the node's positions ``places_m`` (places, 3).
 
-    ``place`` (rows,) is the index of each pose's position.
+    ``place`` (rows,) is the index of the node's position at each pose.
     """
 
     rows: IntArray
@@ -223,12 +223,12 @@ def replay_moving(
     Returns
     -------
     Replay
-        The replay of one tower. ``paths`` start at the position that the tower had at their pose.
+        The replay of one tower. ``paths`` start at the position that the tower has at each pose.
 
     Raises
     ------
     UsageError
-        If the engine is not ``image``, or there is more than one tower. Also everything that :func:`replay` raises.
+        If the engine is not ``image``, or there is more than one tower. :func:`replay` may raise further errors.
 
     Notes
     -----
@@ -251,7 +251,7 @@ def replay_moving(
     if not blocks:
         return replay(site, link, poses, search, field, run)
     if len(blocks) > 1:
-        # all blocks share one tolerance
+        # use one extent for all blocks, so that all have the same tolerances
         run = replace(run, extent_m=extent_of(np.concatenate([poses.position_m, sources_m])))
 
     def of(block: _Block) -> Replay:
@@ -267,7 +267,7 @@ def _scene_of(
     site: Site, link: Link, name: str, poses: Poses, block: _Block
 ) -> tuple[Site, Link, Poses, BoolArray | None]:
     """Return site, link and poses of a block with one tower per position, and a mask of the links to search."""
-    # a single position keeps the tower's name, so that it is replayed as a fixed tower
+    # a single position keeps the name of the tower, so that the tower is replayed as a fixed tower
     names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
     towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
     moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
@@ -279,7 +279,7 @@ def _scene_of(
 
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
-    """Return the replay of a block as a replay of one tower, which had a separate position at each pose."""
+    """Return the replay of a block as a replay of one tower with a separate position at each pose."""
     at = np.arange(len(block.rows)), block.place
     columns: dict[str, Any] = {key: np.ascontiguousarray(getattr(replayed, key)[at][:, None]) for key in PER_LINK}
     return replace(
@@ -291,7 +291,7 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     )
 
 
-# The default ground of a site. The search fits the strength of its reflection.
+# Material of the default ground of a site. The strength of its reflection is fitted.
 _GROUND_MATERIAL = "itu_medium_dry_ground"
 
 
@@ -335,7 +335,7 @@ def every_geometry(
     uav_slants_deg: Sequence[tuple[float, ...]],
     grounds: Sequence[float],
 ) -> tuple[Geometry, ...]:
-    """Return all combinations of the values. Geometries with the same mount are adjacent.
+    """Return the geometries for all combinations of the values. Geometries with the same mount are adjacent.
 
     Parameters
     ----------
@@ -367,7 +367,7 @@ def singular_values_of(
     Parameters
     ----------
     geometries : sequence of Geometry
-        Geometries, grouped by mount: each group needs one evaluation of the field, or two with the ground.
+        Geometries, grouped by mount. Each group needs one evaluation of the field, or two with the ground.
     tower : Array
         Positions, pattern and mount of the tower. The slants are replaced by those of the geometry.
     tower_m : (3,)
@@ -384,7 +384,7 @@ def singular_values_of(
 
     Notes
     -----
-    The UAV receives. Both rays are added as powers: the values are the roots of the eigenvalues of
+    The UAV receives. Both rays are added as powers. The singular values are the roots of the eigenvalues of
     ``L L^H + g^2 G G^H``. This is the mean of ``H H^H`` over a band in which the phase between ground ray and direct
     ray takes all values.
     """
@@ -395,7 +395,8 @@ def singular_values_of(
         for g in run:
             los, ground = (slanted(field, g.uav_slant_deg, g.tower_slant_deg) for field in fields)
             covariance = sum(field @ field.conj().swapaxes(-1, -2) for field in (los, g.ground * ground))
-            # eigvalsh returns ascending eigenvalues, and rounding can make a zero eigenvalue slightly negative
+            # reverse the order, because eigvalsh returns ascending eigenvalues. Rounding can make a zero eigenvalue
+            # slightly negative.
             yield np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
 
 
@@ -407,7 +408,7 @@ def basis_fields(
     Parameters
     ----------
     tower, uav : Array
-        Their slants are not used.
+        Arrays of both ends. Their slants are not used.
     tower_m : (3,)
         Centre of the tower's array [m].
     poses : Poses
@@ -432,7 +433,7 @@ def basis_fields(
     slants = [(upright.reshape(shape), level.reshape(shape)) for shape in ((2, 1, 1), (2, 1, 1, 1))]
     fields = np.zeros((2, 2, 2, n, *ports), dtype=np.complex128)
     for depth in (0, 1) if with_ground else (0,):
-        # the reflection point is NaN: the field uses images only, not points
+        # the reflection point can be NaN, because the field depends only on images
         path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
         columns = geometry(path, faces, table, np.asarray(tower_m)[None, :], poses, link)
         for start in range(0, n, step):

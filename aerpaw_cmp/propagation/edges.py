@@ -1,22 +1,23 @@
 """Paths over one edge of a building: search, contribution to H, and description.
 
-An edge is where two faces of a building meet at an exterior angle above 180 degrees: the rim of a flat roof and its
-upright corners. A path runs from the source, or its image in the ground, to a point of the edge, and on to the target
-or its image in the ground. At this point both legs make the same angle with the edge (Keller's cone). The path exists
-if that point lies on the edge, both legs are free, and the point is on no other building's wall or inside one.
+An edge is a line where two faces of a building meet at an exterior angle above 180 degrees: the rim of a flat roof, and
+the vertical corners below it. A path runs from the source, or its image in the ground, to a point of the edge, and on
+to the target or its image in the ground. At this point, both legs make the same angle with the edge (Keller's cone).
+The path exists if the point is on the edge, both legs are free, and the point is not on a wall of another building or
+inside one.
 
-A reflected leg is straight in the space of the mirrored end. The whole path is straight if both legs are rotated about
-the edge into one plane. The positions of the elements in that plane determine the path length of each pair. Paths,
-directions, patterns and the diffraction matrix are computed for the array centres. The field is therefore continuous
-where a direct or reflected path between the centres ends.
+A reflected leg is straight in the space of the mirrored end. If both legs are rotated about the edge into one plane,
+the complete path is straight. The positions of the elements in that plane determine the path length of each pair.
+Paths, directions, patterns and the diffraction matrix are computed for the array centres. The field is therefore
+continuous where a direct or reflected path between the centres ends.
 
-The field behind an edge is that of the uniform theory of diffraction.
+The field behind an edge is computed by the uniform theory of diffraction.
 
-Angles are measured round the edge from face 0, through air, to face n: a wedge of exterior angle ``n pi`` fills the
-rest. ``e`` is the unit vector along the edge for which ``(t, normal, e)`` is right-handed, ``t`` lying in face 0 away
-from the edge and ``normal`` pointing out of it. A wave that travels along ``s`` is written in the edge-fixed basis
-``beta = (e - cos_beta s) / sin_beta``, ``phi = e x s / sin_beta``, before the edge and after it. Time factor
-``e^{+j omega t}``.
+Angles are measured around the edge from face 0, through air, to face n. The wedge fills the remaining angle, and its
+exterior angle is ``n pi``. ``e`` is the unit vector along the edge for which ``(t, normal, e)`` is right-handed, where
+``t`` lies in face 0 and points away from the edge, and ``normal`` points out of face 0. A wave that travels along ``s``
+is written in the edge-fixed basis ``beta = (e - cos_beta s) / sin_beta``, ``phi = e x s / sin_beta``, before the edge
+and after it. Time factor ``e^{+j omega t}``.
 
 Sources: Kouyoumjian and Pathak, Proc. IEEE 62 (1974) 1448, doi 10.1109/PROC.1974.9651 (the coefficients and their
 continuity); Luebbers, IEEE Trans. Antennas Propag. 32 (1984) 70, doi 10.1109/TAP.1984.1143189 (finite conductivity).
@@ -54,7 +55,7 @@ def wedge(
     Parameters
     ----------
     phi_in, phi_out : (...)
-        Angles of source and target round the edge [rad], between 0 and ``exterior * pi``.
+        Angles of source and target around the edge [rad], between 0 and ``exterior * pi``.
     cos_beta : (...)
         Cosine of the angle between ray and edge, the same on both sides (Keller's cone).
     exterior : (...)
@@ -85,13 +86,13 @@ def wedge(
     upright, across = obliquity(phi_in, phi_out, exterior)
     # sine of the grazing angle, equal to the cosine from the normal in Fresnel's formulas
     sine = upright * np.sqrt(1.0 - cos_beta * cos_beta)
-    # seen from face n, both the angles and the edge are reversed, so the matrix is the same
+    # seen from face n, both the angles and the direction of the edge are reversed, so the matrix is the same
     (te_n, tm_n), (te_0, tm_0) = coefficients(sine, face_n), coefficients(sine, face_0)
     te, tm = at_n * te_n + at_0 * te_0, at_n * tm_n + at_0 * tm_0
     # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
-    askew = cos_beta * upright  # like across, multiplied by the sine of incidence: -(sigma . phi) and -(sigma . beta)
+    askew = cos_beta * upright  # multiplied, like across, by the sine of incidence: -(sigma . phi) and -(sigma . beta)
     size = across * across + askew * askew
-    # for a ray along the edge both are zero, and any plane of incidence is valid
+    # for a ray along the edge, both components are zero, and any plane of incidence is valid
     weight = 1.0 / np.where(size == 0.0, 1.0, size)
     along, mixed, sideways = np.where(size == 0.0, 1.0, across * across * weight), across * askew * weight, askew**2
     sideways = sideways * weight
@@ -128,7 +129,7 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
     up, down = (np.abs(np.sin((np.pi + turn) / (2.0 * exterior))) for turn in (less, -less))
     # swapping source and target swaps ``up`` and ``down``, but not the smaller and the larger of the two
     near, far = np.minimum(up, down), np.maximum(up, down)
-    # at the shadow boundary cosine and ``near`` go to 0, and their ratio goes to the exterior angle over pi
+    # at the shadow boundary, cosine and ``near`` go to 0, and their ratio goes to the exterior angle over pi
     ratio = np.where(near < 1e-9, exterior, np.abs(np.cos(less / 2.0)) / np.maximum(near, 1e-9))
     lifted = np.sin(phi_in / exterior) * np.sin(phi_out / exterior) / np.maximum(far, 1e-9)
     return np.clip(ratio * lifted, 0.0, 1.0), np.sin(less / 2.0)
@@ -137,7 +138,7 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
 def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> ComplexArray:
     """Return ``cot(angle / 2n) F(x)``. F cancels the pole of the cotangent at a shadow boundary.
 
-    The angle repeats every 2 pi n round the edge. If it is measured from the nearest boundary, the argument of F is
+    The angle repeats every 2 pi n around the edge. If it is measured from the nearest boundary, the argument of F is
     ``x = 2 distance sin^2(angle / 2)``, so the factor sin(angle / 2) cancels the pole in closed form.
 
     Parameters
@@ -155,7 +156,7 @@ def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> 
     above, below = np.abs(np.sin(np.pi * turns * exterior)), np.sin(np.pi * turns)
     # on the boundary itself the ray that grazes the edge counts as visible, so use the limit from the lit side
     ratio = np.where(below == 0.0, exterior, above / np.where(below == 0.0, 1.0, below))
-    # use w of a root instead of F of a square, because wofz is exact at zero and far away
+    # use w of a root instead of F of a square, because wofz is accurate both at zero and at large arguments
     reach = np.sqrt(2.0 * distance)
     return np.asarray(transition(reach * above) * np.cos(np.pi * turns) * reach * ratio)
 
@@ -168,21 +169,21 @@ def transition(root: FloatArray) -> ComplexArray:
     return np.asarray(np.sqrt(np.pi) * np.exp(0.25j * np.pi) * wofz(np.exp(0.75j * np.pi) * root))
 
 
-# An end nearer than this to an edge has no path over it, because it is not in the far field.
+# If an end is nearer than this to an edge [m], there is no path over the edge, because the end is not in the far field.
 NEAREST_M = 0.01
 
 # If the exterior angle is nearer than this to 180 degrees [rad], the two faces count as one plane.
 _SHARPEST = 1e-6
 
-# The formula is asymptotic: faces lower than this many wavelengths are not treated as wedges, nor their building as an
-# obstacle.
+# The formula is asymptotic. Faces lower than this number of wavelengths are not treated as wedges, nor their buildings
+# as obstacles.
 _LEAST_WAVELENGTHS = 0.5
 
-# Distance from an edge point at which the air on both of its faces is checked.
-# It is far above the rounding of coordinates at 1 km, and far below the gap between two walls of a map.
+# Distance from an edge point at which the program checks that there is air next to both faces [m]. It is far above the
+# rounding error of coordinates at 1 km, and far below the gap between two walls of a map.
 _PROBE_M = 1e-3
 
-# Number of pairs of edge and pose that are examined together. It limits the memory and does not change a result.
+# Number of pairs of edge and pose that are examined together. It limits the memory, and does not change the result.
 LINKS_AT_ONCE = 200_000
 
 
@@ -218,7 +219,7 @@ class EdgePaths(Further):
         return len(self.pose)
 
     def lines(self) -> PathSet:
-        """Return the same polylines without faces."""
+        """Return the paths as polylines without faces."""
         # legs() requires used corners first; the stable sort keeps their order
         used = np.isfinite(self.vertices_m).all(axis=2)
         first = np.argsort(~used, axis=1, kind="stable")
@@ -248,7 +249,7 @@ class EdgePaths(Further):
     def fields(
         self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        """Return what the paths add to H and to the powers.
+        """Return the contributions of the paths to H and to the powers.
 
         Parameters
         ----------
@@ -283,7 +284,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     scene : Scene
     poses : Poses
     link : Link
-        Link. Its carrier decides which buildings are too low for diffraction.
+        Link. Its carrier determines which buildings are too low for diffraction.
 
     Returns
     -------
@@ -306,7 +307,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     none = np.zeros(0, np.int64)
     pieces = [EdgePaths(none, none, np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 3, 3)))]
     for tower in range(len(sources)):
-        # -1: no reflection on that side
+        # -1 means no reflection on that side
         grounds = [-1, *np.flatnonzero(scene.usable[tower] & (faces.solid < 0)).tolist()]
         rows = np.flatnonzero(known & ~scene.excluded[tower])
         for ground in itertools.product(grounds, grounds) if len(search.edges) else ():
@@ -354,7 +355,7 @@ class Edges(NamedTuple):
     def of(cls, faces: Faces, wavelength: float = 0.0) -> Edges:
         """Return edges of the prisms of a scene, except prisms lower than half a wavelength [m].
 
-        A vertical edge starts at the highest level ground if its wall starts below that.
+        A vertical edge starts at the highest level ground if its wall starts below this ground.
         """
         # walls extend below the ground, where an edge does not diffract
         ground_m = max(0.0, float(faces.offset_m[faces.solid == -1].max(initial=0.0)))
@@ -371,7 +372,7 @@ class Edges(NamedTuple):
 
 
 def wedge_axes(normal: FloatArray, normal_n: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return directions of edges, axes of their faces 0 (edges, 3) and exterior angles over pi, from both normals."""
+    """Return directions of edges, axes in their faces 0 (edges, 3) and exterior angles over pi, from both normals."""
     cross = np.cross(normal, normal_n)
     sine = np.linalg.norm(cross, axis=1)
     along = cross / sine[:, None]
@@ -383,7 +384,7 @@ def _of_solid(
     faces: Faces, solid: int, ground_m: float, least_m: float
 ) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
     """Return start, end and faces of each edge, in the order that the axes of :class:`Edges` require."""
-    # list only edges between faces of one building, not edges between two touching buildings
+    # list only edges between faces of the same building, not edges between two touching buildings
     members = np.flatnonzero(faces.solid == solid)
     walls = [int(i) for i in members if faces.normal[i, 2] == 0.0]
     roofs = {float(faces.offset_m[i]): int(i) for i in members if faces.normal[i, 2] == 1.0}
@@ -399,7 +400,7 @@ def _of_solid(
             # t is in the plane of the wall and points down, so t x normal points along the wall
             rows.append((far, near, (wall, roofs[top])))
         following = first.get(_corner(faces, wall, 1))
-        # the wall turns left: at an inner corner the air is on the hollow side, and no wave is diffracted there
+        # require a left turn: at an inner corner, the air is on the hollow side, and no wave is diffracted
         if following is not None and np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
             # t is in the plane of the wall and points away from the corner
             rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
@@ -415,12 +416,12 @@ def _point(faces: Faces, wall: int, end: int, height_m: float) -> FloatArray:
 def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
     """Return a corner of the footprint, rounded to 0.1 mm, as a key."""
     point = _point(faces, wall, end, 0.0)
-    # both walls compute the corner from their own plane, so the last digits differ
+    # each wall computes the corner from its own plane, so the last digits differ
     return round(float(point[0]), 4), round(float(point[1]), 4)
 
 
 class _Search:
-    """Paths over the edges of a scene."""
+    """The search for paths over the edges of a scene."""
 
     def __init__(self, faces: Faces, edges: Edges, sources_m: FloatArray, targets_m: FloatArray) -> None:
         self.faces, self.edges = faces, edges
@@ -432,12 +433,13 @@ class _Search:
         high = np.maximum(edges.start_m, edges.end_m) + 2.0 * _PROBE_M
         touch = (self.hiding.low[None] <= high[:, None]) & (self.hiding.high[None] >= low[:, None])
         near = np.asarray(touch.all(axis=2))
-        # an edge always touches its building
+        # ignore the building of the edge, which always touches it
         near[np.arange(len(edges)), solid] = False
         # edges at which another building may touch a face
         self.doubtful = np.asarray(near.any(axis=1))
         axis_n = np.cross(edges.along, edges.normal_n)
-        # probe along each face and a tenth of that outwards, because a probe in the plane would graze the wall
+        # probe along each face, and outwards by a tenth of the distance, because a probe in the plane would graze the
+        # wall
         self.sides = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
 
     def of_tower(
@@ -485,7 +487,7 @@ class _Search:
         point, good = vertices_m[:, 1], np.ones(len(edge), np.bool_)
         for index, end in zip(ground, (source_m, target_m), strict=True):
             if index >= 0:
-                # there is no reflection between the ground and an edge in the ground
+                # an edge in the ground has no leg that the ground reflects
                 good &= (self.faces.height_m(index, point) > NEAREST_M) & (self.faces.height_m(index, end) > 0.0)
         good[good] &= self._exposed(edge[good], point[good])
         for start, end in legs(source_m, vertices_m, target_m):
@@ -497,19 +499,19 @@ class _Search:
         good = np.ones(len(edge), dtype=np.bool_)
         rows = np.flatnonzero(self.doubtful[edge])
         for side in (0, 1):
-            # check only the second half: the first half may lie within the rounding error of the edge
+            # check only the second half of the probe: the first half may lie within the rounding error of the edge
             step = _PROBE_M * self.sides[edge[rows], side]
             good[rows] &= ~self.hiding.segments(points_m[rows] + 0.5 * step, points_m[rows] + step)
         return good
 
     def _round_edges(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return positions (edges, points) along edges, and distances from them. -1 inside the wedge or too close."""
+        """Return positions (edges, points) along edges, and distances from them, -1 inside the wedge or too close."""
         edges = self.edges
         axes = np.stack([edges.along, edges.face_axis, edges.normal, edges.normal_n])
         start = (axes * edges.start_m).sum(axis=2)
         along, down, up, up_n = axes @ points_m.T - start[..., None]
         far = np.hypot(down, up)
-        # a point in front of neither face is inside the wedge, where there is no wave
+        # a point that is not in front of any face is inside the wedge, where there is no wave
         return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
 
     def _on_ground(self, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:
@@ -530,7 +532,7 @@ class _End(NamedTuple):
 
     ``centre_m`` (paths, 3); ``axes`` (paths, 3, 3) of the device as rows. ``normal`` (paths, 3) and ``face`` (paths, 3)
     belong to the leg's mirror, and ``bounced`` (paths,) is True if there is a mirror. Positions (paths or 1, 3,
-    elements) and slants (paths or 1, 2, elements) belong to the elements.
+    elements) and slants (paths or 1, 2, elements) are those of the elements.
     """
 
     centre_m: FloatArray
@@ -550,7 +552,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     paths : EdgePaths
     faces : Faces
     sources_m : (towers, 3) or (poses, towers, 3)
-        [m]
+        Centres of the tower arrays [m].
     poses : Poses
     link : Link
 
@@ -575,7 +577,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     rise = place[1][0] - place[0][0]
     total = np.hypot(near + far, rise)
     sine, cosine = (near + far) / total, rise / total
-    # the angle is 0 in face 0 and grows up to the exterior angle, without a jump from pi to minus pi
+    # take the angle modulo 2 pi: it is 0 in face 0 and increases up to the exterior angle, without a jump at pi
     phi_in, phi_out = (np.mod(np.arctan2(up, down), 2.0 * np.pi) for _, down, up in place)
     distance, materials = wave_number * near * far / total, (tuple(table[face].T) for face in (face_0, face_n))
     bb, bp, pp = wedge(phi_in, phi_out, cosine, exterior, distance, *materials)
@@ -603,7 +605,7 @@ def _ends(
 ) -> tuple[_End, _End]:
     """Return the source and target of each path, mirrored if their leg is reflected."""
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
-    # transposed, because the formulas take the axes as rows
+    # transpose, because the formulas need the axes as rows
     mounts = np.stack([array.mount.T for array in arrays])
     axes = np.einsum("nij,jk->nki", poses.rotation[paths.pose], uav.mount)
     places, slants = np.stack([a.positions_m.T for a in arrays]), np.stack([a.slant_parts for a in arrays])
@@ -645,10 +647,10 @@ def _round_edge(
     end: _End, way: FloatArray, sign: float, along: FloatArray, cosine: FloatArray,
     pattern: tuple[ComplexArray, ComplexArray],
 ) -> tuple[ComplexArray, ComplexArray]:  # fmt: skip
-    """Return fields (paths, elements) of an end's elements in the edge-fixed basis, times the sine with the edge.
+    """Return fields (paths, elements) of an end in the edge-fixed basis, times the sine of the angle with the edge.
 
-    ``way`` (paths, 3) is the direction of the wave where the leg meets the edge. ``sign`` is 1 at the source. It is -1
-    at the target, whose elements are evaluated in the opposite direction.
+    ``way`` (paths, 3) is the direction of the wave where the leg meets the edge. ``sign`` is 1 at the source, and -1 at
+    the target, whose elements are evaluated in the opposite direction.
     """
     flat, cross = along - cosine[:, None] * way, np.cross(along, way)
     toward, normal = parts_of(way), parts_of(end.normal)

@@ -27,13 +27,13 @@ from .options import Run, Search
 from .scene import Scene
 from .search import mirror
 
-# Number of faces above which sequences of two reflections are found by compiled beams. The paths are the same.
+# Number of faces above which paths with two reflections are searched by compiled beams. The result is the same.
 MANY_FACES = 400
 
 # PathSolver finds a wall of solid angle W with probability ``1 - exp(-N W / 4 pi)``, so the required rays depend on the
-# smallest and farthest walls. Pilot searches on a batch of poses use more rays each time, until two find the same
-# paths. A wall that both searches miss can still be lost at other poses. The audit reports such a wall.
-# Rays per tower of the first pilot search.
+# smallest and farthest walls. Pilot searches on a batch of poses use more and more rays, until two of them find the
+# same paths. A wall that both searches miss can still be lost at other poses. The audit reports such a wall. The
+# constant is the number of rays per tower of the first pilot search.
 FIRST = 10_000
 
 _FACTOR = 4
@@ -46,7 +46,7 @@ def path_cache(search: Search, run: Run) -> PathCache | None:
     """Return the path cache of a replay, or None if it does not use one."""
     folder = run.cache_dir
     if folder is None:
-        # do not use a cache for the image engine, which is faster than reading its paths from a file
+        # do not cache paths of the image engine, which finds them faster than they can be read from a file
         if search.engine != "sionna":
             return None
         folder = cache_folder()
@@ -82,7 +82,7 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
     while samples < MOST:
         samples *= _FACTOR
         paths = pilot(samples)
-        # compare the paths, not their number: one path may be lost while another is found
+        # compare the paths and not their number, because one path may be lost while another is found
         if set(mirror.plane_keys(paths, plane)) == set(mirror.plane_keys(before, plane)):
             words = (
                 f"{samples // _FACTOR:,} and {samples:,} rays per tower found the same {counted(len(paths), 'path')}"
@@ -107,7 +107,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     Returns
     -------
     Choice or None
-        None if the number is given or no rays are cast.
+        None if the number is given, or if the engine does not cast rays.
     """
     if search.engine != "sionna" or search.samples != "auto":
         return None
@@ -207,7 +207,7 @@ LAYOUT = 4
 # Columns of an entry. The terrain changes paths after the search.
 _STORED = ("pose", "tower", "depth", "faces", "vertices_m")
 
-# Written after the entry, before the SHA-256 of all preceding bytes.
+# Mark that is written after the entry, before the SHA-256 of all preceding bytes.
 _SEAL = b"AERPAWCP"
 
 
@@ -217,7 +217,7 @@ class PathCache:
     Parameters
     ----------
     folder : Path
-        Created when the first entry is saved.
+        Folder, which is created when the first entry is saved.
 
     Attributes
     ----------
@@ -230,7 +230,7 @@ class PathCache:
         self.warnings: list[str] = []
 
     def key(self, scene: Scene, targets_m: FloatArray, carrier_hz: float, search: Search) -> str:
-        """Return the digest of everything that decides the paths.
+        """Return the digest of everything that determines the paths.
 
         Parameters
         ----------
@@ -239,7 +239,7 @@ class PathCache:
         targets_m : (n, 3)
             Poses [m].
         carrier_hz : float
-            Used for Sionna only: paths of the image engine do not depend on the frequency.
+            Carrier frequency, only used for Sionna: paths of the image engine do not depend on it.
         search : Search
             Engine, depth, samples and other search options.
 
@@ -251,7 +251,7 @@ class PathCache:
         faces, surfaces = scene.faces, scene.surfaces
         decides: list[object] = [__version__, LAYOUT, search.engine, search.max_depth, search.samples, search.batch]
         if search.engine == "sionna":
-            # another version of Sionna's tracer may find other paths, whereas the image engine is exact
+            # include the versions, because another version of Sionna's tracer may find other paths
             decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]
         columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
         mesh = None if surfaces is None else (surfaces.corners_m, surfaces.first)
@@ -271,7 +271,7 @@ class PathCache:
             return None
         if entry is None:
             return None
-        # never pickled: an entry of a shared folder must not run code
+        # do not allow pickles: an entry in a shared folder must not run code
         with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
             return PathSet(**{name: columns[name] for name in _STORED}), float(columns["seconds"])
 

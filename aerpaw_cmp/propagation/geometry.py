@@ -3,15 +3,15 @@
 A path is an ordered list of reflecting faces between the source (tower) and the target (UAV). Lengths, phases
 and fields are not stored: :mod:`aerpaw_cmp.propagation.field.sum` evaluates them in float64 from the faces.
 
-The faces of a site are planar: one ground plane per ground height, walls and flat roofs of the buildings.
+The faces of a site are planar: a ground plane for each ground height, and the walls and flat roofs of the buildings.
 
-Walls extend below the ground so that there is no gap at their foot. Buildings have no bottom face. Collinear edges of a
-footprint form one wall, regardless of the number of vertices on the map.
+Walls extend below the ground, so that there is no gap at their foot. Buildings have no bottom face. Collinear edges of
+a footprint form one wall, regardless of the number of vertices on the map.
 
 The module also contains antenna arrays, poses and links between towers and the UAV.
 
 Device frame of every array: x forward (boresight), y left, z up. A pattern is a function of zenith angle theta and
-azimuth phi in that frame (from x towards y). Rotations are (3, 3) matrices that turn device coordinates into site
+azimuth phi in that frame (from x towards y). Rotations are (3, 3) matrices that convert device coordinates to site
 coordinates (east, north, up): ``v_site = R @ v_device``.
 """
 
@@ -35,17 +35,17 @@ from ..site.site import Building, Site
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """Ends of the links whose paths are searched.
+    """The ends of the links whose paths are searched.
 
     Parameters
     ----------
     sources_m : (towers, 3)
     targets_m : (poses, 3)
-        NaN positions have no path.
+        Positions of the UAV [m]. A position with NaN has no path.
     usable : (towers, faces) bool, optional
-        Faces that may reflect for each tower (default: all). All faces block paths.
+        Faces that may reflect for each tower. Default: all. All faces can block paths.
     excluded : (towers, poses) bool, optional
-        Links without any path, e.g. poses inside buildings.
+        Links without any path, for example to poses inside buildings.
     """
 
     sources_m: FloatArray
@@ -61,11 +61,11 @@ _WORDS = ("material", "label", "polygon")
 
 @dataclass(frozen=True, slots=True)
 class Faces:
-    """Planar reflecting faces of a scene.
+    """The planar reflecting faces of a scene.
 
     A point ``x`` on a face has the in-plane coordinates ``(along . x, across . x)`` [m]. Only the first four columns
-    determine fields. The other columns determine which points belong to a face. Without these columns, faces are
-    unbounded planes.
+    determine fields. The remaining columns determine which points belong to a face. Without them, faces are unbounded
+    planes.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Faces:
     material : tuple of str, length faces
         Names that :func:`aerpaw_cmp.site.materials.material` knows.
     label : tuple of str, length faces
-        Name of each face for reports, for example ``"ground"``, ``"barn wall 3"``.
+        Name of each face for reports, for example ``"ground"`` or ``"barn wall 3"``.
     along, across : (faces, 3)
         In-plane unit axes, ``along x across = normal``.
     lower, upper : (faces, 2)
@@ -84,7 +84,7 @@ class Faces:
     polygon : tuple of Polygon or None, length faces
         Outline of the face in its plane, if it does not fill its bounds.
     solid : (faces,) int
-        Index of the building, -1 for the ground, which never hides anything.
+        Index of the building, -1 for the ground, which does not block paths.
     """
 
     normal: FloatArray
@@ -102,7 +102,7 @@ class Faces:
         count = len(self.normal)
         if self.along.shape == (count, 3):
             return
-        # start from the axis that is least along the normal, because a nearly parallel axis would lose digits
+        # start from the axis that is least parallel to the normal, because a nearly parallel axis would lose digits
         helper = np.eye(3)[np.argmin(np.abs(self.normal), axis=1)] if count else np.zeros((0, 3))
         along = np.cross(helper, self.normal)
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -117,11 +117,11 @@ class Faces:
         return len(self.normal)
 
     def height_m(self, face: int, points_m: FloatArray) -> FloatArray:
-        """Return heights (...) of points (..., 3) in front of the plane of one face."""
+        """Return distances (...) of points (..., 3) in front of the plane of one face [m]."""
         return np.asarray(points_m @ self.normal[face] - self.offset_m[face])
 
     def mirrored(self, face: int, points_m: FloatArray) -> FloatArray:
-        """Return images of points (..., 3) in the plane of one face."""
+        """Return mirror images of points (..., 3) in the plane of one face."""
         return np.asarray(points_m - 2.0 * self.height_m(face, points_m)[..., None] * self.normal[face])
 
     def select(self, rows: IntArray) -> Faces:
@@ -143,8 +143,8 @@ def joined(*pieces: Faces) -> Faces:
 class BoxTree(NamedTuple):
     """A tree of bounding boxes, stored as columns.
 
-    ``lower``, ``upper`` (nodes, 3) are bounds, ``child`` (nodes,) the first of two children or -1. A leaf
-    contains ``many`` of the ``items`` from ``start`` on.
+    ``lower`` and ``upper`` (nodes, 3) are the bounds, and ``child`` (nodes,) is the first of two children, or -1. A
+    leaf contains ``many`` items, from ``start`` on in ``items``.
     """
 
     lower: FloatArray
@@ -157,18 +157,19 @@ class BoxTree(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Surfaces:
-    """Faces of a triangle scene.
+    """The faces of a scene of triangles.
 
     Parameters
     ----------
     faces : Faces
-        Planes, materials and labels; ``solid`` is the shape. Their polygons are the triangles below.
+        Planes, materials and labels. ``solid`` is the number of the shape. The outlines are given by the triangles
+        below.
     corners_m : (triangles, 3, 3)
         Corners of every triangle, as in the file.
     face : (triangles,) int
         Face of each triangle. The triangles of a face are consecutive.
     first : (faces + 1,) int
-        Where the triangles of each face begin.
+        Index of the first triangle of each face.
     flat_m : (triangles, 3, 2)
         Corners in the axes of their face.
     window_m : (faces, 8, 3)
@@ -178,7 +179,7 @@ class Surfaces:
     tree, face_tree : BoxTree
         Trees over triangles and over faces.
     notes : tuple of str
-        Repairs of the scene.
+        Sentences about repairs of the scene.
     """
 
     faces: Faces
@@ -218,14 +219,14 @@ class Rows:
 
     @classmethod
     def one_after_another(cls: type[RowsT], pieces: Sequence[RowsT]) -> RowsT:
-        """Return the paths of all pieces, at least one, in the given order. Nothing is sorted."""
+        """Return the paths of all pieces (at least one piece) in the given order, without sorting."""
         names = [column.name for column in fields(cls)]  # type: ignore[arg-type]
         return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
 
 @dataclass(frozen=True, slots=True)
 class PathSet(Rows):
-    """All paths of a replay, sorted by pose, tower, depth, faces.
+    """Direct and reflected paths of a replay, sorted by pose, tower, depth and faces.
 
     Parameters
     ----------
@@ -238,7 +239,7 @@ class PathSet(Rows):
     vertices_m : (paths, max_depth, 3)
         Reflection points for array centres, NaN where unused.
     terrain_db : (paths,)
-        Loss at ground that is curved within the Fresnel zone. Default: 0.
+        Loss of a reflection off ground that is curved within the Fresnel zone [dB]. Default: 0.
     """
 
     pose: IntArray
@@ -257,7 +258,7 @@ class PathSet(Rows):
         return len(self.pose)
 
     def lines(self) -> PathSet:
-        """Return the set itself, because its paths are polylines already."""
+        """Return the set itself, because its paths already are polylines."""
         return self
 
     @property
@@ -267,7 +268,7 @@ class PathSet(Rows):
 
     @property
     def turns(self) -> IntArray:
-        """Digits of each path (paths,): a 1 for each reflection."""
+        """Digits of each path (paths,): a digit 1 for each reflection."""
         # 1, 11, 111
         return np.asarray((10**self.depth - 1) // 9)
 
@@ -313,7 +314,7 @@ def sources_of(paths: Rows, sources_m: FloatArray) -> FloatArray:
 def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Iterate over the starts and ends (paths, 3) of the legs of polylines, leg by leg.
 
-    An unused vertex (NaN) is replaced by the point after it, so that the leg from there has zero length.
+    An unused vertex (NaN) is replaced by the next point, so that the leg from it has zero length.
     """
     # go backwards, so that an unused corner gets the position of the next corner
     points = [target_m]
@@ -341,11 +342,11 @@ def path_lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -
     return total
 
 
-# Walls start this far below the lower of their base and the site ground.
+# Walls start at this distance below the lower of their base and the site ground [m].
 _WALL_FOOT_M = 0.5
 
-# Two edges are one wall if the sine of the angle between them is below this.
-# It is one nanometre over one metre, and maps are drawn to the millimetre.
+# Two edges belong to one wall if the sine of the angle between them is below this: a nanometre over a metre. Maps are
+# drawn to the millimetre.
 _COLLINEAR = 1e-9
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -358,8 +359,8 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
     ----------
     site : Site
     towers : sequence of str, optional
-        Towers whose ground heights need a plane. Default: all towers of the site. If there are no towers, the
-        plane is ``up = 0``.
+        Towers whose ground heights need a plane. Default: all towers of the site. If the site has no towers, the plane
+        is ``up = 0``.
 
     Returns
     -------
@@ -373,7 +374,7 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
 
 @lru_cache(maxsize=16)
 def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Building, ...]) -> Faces:
-    """Return the faces of ground planes and buildings. They are cached, because each part of a replay requests them."""
+    """Return the faces of ground planes and buildings. Cached: each part of a replay requests them."""
     count = len(grounds)
     label = ("ground",) if count == 1 else tuple(f"ground at {height:g} m" for height in grounds)
     pieces = [Faces(np.tile(_UP, (count, 1)), np.array(grounds), (ground_material,) * count, label)]
@@ -395,8 +396,8 @@ def _parts(footprint: Polygon) -> list[Polygon]:
 
 
 def _corners(ring: shapely.LinearRing) -> FloatArray:
-    """Return vertices (corners, 2) of a ring at which it turns."""
-    # a ring repeats its first corner; a third coordinate of the map is not used as a height
+    """Return the vertices (corners, 2) at which a ring turns."""
+    # omit the repeated first corner of the ring, and a third coordinate of the map, which is not a reliable height
     points = np.asarray(ring.coords, dtype=np.float64)[:-1, :2]
     # a triangle keeps its corners, even if it is very flat
     while len(points) > 3:
@@ -407,7 +408,7 @@ def _corners(ring: shapely.LinearRing) -> FloatArray:
         flat = np.abs(turn) <= _COLLINEAR * length
         if not flat.any():
             break
-        # remove one vertex at a time, because its neighbours change
+        # remove one vertex at a time, because the neighbours of a vertex change
         points = np.delete(points, np.flatnonzero(flat)[0], axis=0)
     return points
 
@@ -419,7 +420,7 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> Faces:
     edge = np.concatenate([np.diff(ring, axis=0) for ring in rings])
     length, count = np.hypot(*edge.T), len(edge)
     along = np.column_stack([edge / length[:, None], np.zeros(count)])
-    # the normal is along x up: the building is to the left of every edge, so the outside is to the right
+    # the normal is ``along x up``: the building is on the left of every edge, so the outside is on the right
     normal = np.column_stack([along[:, 1], -along[:, 0], np.zeros(count)])
     # in-plane coordinates are measured from the site's origin, not from the wall's corner
     first = (along[:, :2] * start).sum(axis=1)
@@ -446,9 +447,9 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> Faces:
     along = np.array([longest[0], longest[1], 0.0]) / np.hypot(*longest)
     across = np.array([-along[1], along[0], 0.0])
     turned = shapely.transform(footprint, lambda p: p @ np.column_stack([along[:2], across[:2]]))
-    # a rotated rectangle fills its bounds only along its axes
+    # rotate first: a rectangle fills its bounds only along its own axes
     low_a, low_b, high_a, high_b = turned.bounds
-    # most roofs are rectangles: the bounds decide what is inside, without a polygon
+    # most roofs are rectangles, for which the bounds are enough and a polygon is not needed
     fills = np.isclose(turned.area, (high_a - low_a) * (high_b - low_b), rtol=1e-12, atol=0.0)
     polygon = None if fills else turned
     shapely.prepare(polygon)
@@ -467,7 +468,7 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> Faces:
 
 
 def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: float) -> BoolArray:
-    """Check whether points, taken as lying in the plane of their face, belong to the face.
+    """Check whether points belong to their face, assuming that they lie in its plane.
 
     Parameters
     ----------
@@ -485,7 +486,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
     """
     a = np.einsum("ij,ij->i", faces.along.take(index, 0), points_m)
     b = np.einsum("ij,ij->i", faces.across.take(index, 0), points_m)
-    # use take, because indexing with brackets is several times slower for rows of two numbers
+    # use take, because for rows of two numbers, indexing with brackets is several times slower
     low, high = (faces.lower - tolerance_m).take(index, 0), (faces.upper + tolerance_m).take(index, 0)
     good = (a >= low[:, 0]) & (a <= high[:, 0]) & (b >= low[:, 1]) & (b <= high[:, 1])
     # test polygons last, and only for points within the bounds
@@ -505,7 +506,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
 
 
 def corners(faces: Faces, reach_m: float = np.inf) -> FloatArray:
-    """Return corners (faces, 4, 3) of the in-plane bounds, in order round the face, cut at ``reach_m`` if infinite."""
+    """Return corners (faces, 4, 3) of the in-plane bounds, in order around the face, cut at ``reach_m`` if infinite."""
     low = np.clip(faces.lower, -reach_m, reach_m)
     high = np.clip(faces.upper, -reach_m, reach_m)
     a = np.stack([low[:, 0], high[:, 0], high[:, 0], low[:, 0]], axis=1)
@@ -544,7 +545,7 @@ def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntAr
         else:
             base = faces.normal[index] * faces.offset_m[index]
             axes = np.stack([faces.along[index], faces.across[index]])
-            # a constrained triangulation, because a plain one would also cover the hollows
+            # use a constrained triangulation, because a plain triangulation would also cover courtyards
             pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
             parts = [base + np.asarray(orient(piece, 1.0).exterior.coords)[:3] @ axes for piece in pieces]
         vertices.extend(parts)
@@ -559,7 +560,7 @@ def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
     top = np.array([building.base_m + building.height_m for building in site.buildings])
     low = np.flatnonzero(np.isfinite(points_m).all(axis=1) & (points_m[:, 2] < top.max(initial=-np.inf)))
     if len(low):
-        # "within" is strict: a pose on a wall or a roof is not inside
+        # "within" is strict, so that a pose on a wall or a roof is not inside
         tree = shapely.STRtree([building.footprint for building in site.buildings])
         point, building = tree.query(shapely.points(points_m[low, :2]), predicate="within")
         result[low[point[points_m[low[point], 2] < top[building]]]] = True
@@ -567,7 +568,7 @@ def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
 
 
 class Pattern(Protocol):
-    """An element's far field.
+    """The far field of an element.
 
     ``field(theta_rad, phi_rad)`` returns complex ``(E_theta, E_phi)`` of the broadcast shape, scaled so that
     ``|E_theta|^2 + |E_phi|^2`` is the gain (linear, over isotropic).
@@ -623,7 +624,7 @@ class Poses:
     position_m : (poses, 3)
         Array centre, east-north-up [m].
     rotation : (poses, 3, 3)
-        Aircraft body (forward-left-up) to site frame.
+        Rotation from the aircraft body (forward-left-up) to the site frame.
     """
 
     position_m: FloatArray
@@ -638,7 +639,7 @@ class Poses:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Radio settings of a replay.
+    """The radio settings of a replay.
 
     Parameters
     ----------
@@ -652,7 +653,7 @@ class Link:
     uav_transmits : bool
         True if the UAV transmits. The channel matrix is always ``(n_rx, n_tx)``.
     noise_floor_dbm : float
-        A link received below this level is out of coverage. Default: thermal noise of 1 Hz.
+        A link with a received level below this is out of coverage. Default: thermal noise in 1 Hz.
     """
 
     carrier_hz: float
@@ -664,7 +665,7 @@ class Link:
 
 
 def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, roll_rad: FloatArray) -> FloatArray:
-    """Return the device-to-site rotation of 3GPP TR 38.901 eq. (7.1-4): ``Rz(yaw) Ry(pitch) Rx(roll)``.
+    """Return the device-to-site rotation of 3GPP TR 38.901, eq. (7.1-4): ``Rz(yaw) Ry(pitch) Rx(roll)``.
 
     Source: 3GPP TR 38.901 eq. 7.1-4.
 
@@ -685,7 +686,7 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
     [0.0, 1.0, 0.0]
     """
     yaw, pitch, roll = np.broadcast_arrays(*map(unmasked, (yaw_rad, pitch_rad, roll_rad)))
-    # write out the product, which needs one pass over a flight instead of three
+    # write the product out: one pass over a flight instead of three
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)
     cg, sg = np.cos(roll), np.sin(roll)
@@ -700,7 +701,7 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
 
 
 def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg: FloatArray) -> FloatArray:
-    """Return the body-to-site rotation of an aircraft attitude.
+    """Return the body-to-site rotation for an attitude of the aircraft.
 
     Parameters
     ----------
@@ -710,7 +711,7 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
     Returns
     -------
     ndarray, (..., 3, 3)
-        Body axes forward-left-up to east-north-up.
+        Rotation from the body axes (forward-left-up) to east-north-up.
 
     Examples
     --------
@@ -718,7 +719,8 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
     >>> (r @ [1, 0, 0]).round(12).tolist()
     [1.0, 0.0, 0.0]
     """
-    # nose up + turns the boresight up, TR 38.901 pitch turns it down; right wing down is a positive roll in both
+    # a positive pitch turns the nose up here, but the boresight down in TR 38.901. Right wing down is a positive roll
+    # in both.
     return rotation_from_yaw_pitch_roll(np.pi / 2 - np.radians(yaw_deg), -np.radians(pitch_deg), np.radians(roll_deg))
 
 
@@ -734,7 +736,8 @@ def rotation_from_axes(yaw_deg: FloatArray, up: FloatArray) -> FloatArray:
     """
     yaw, up = np.radians(yaw_deg), np.broadcast_to(up, (len(yaw_deg), 3))
     nose = np.stack([np.sin(yaw), np.cos(yaw), 0.0 * yaw], axis=1)
-    # start with a level nose and lower it until it is perpendicular to the upward axis, which keeps its bearing
+    # start with a level nose, and tilt it until it is perpendicular to the upward axis. This does not change its
+    # bearing.
     nose[:, 2] = -(nose * up).sum(axis=1) / up[:, 2]
     nose /= np.linalg.norm(nose, axis=1, keepdims=True)
     return np.stack([nose, np.cross(up, nose), up], axis=2)
@@ -746,7 +749,7 @@ _TOWER_PORTS_M = (0.0, 0.060, 1.740, 1.800)
 
 
 def _centred_line(along_m: FloatArray) -> FloatArray:
-    # the line is across the boresight, which is x
+    # the line of elements is perpendicular to the boresight x
     positions = np.zeros((len(along_m), 3))
     positions[:, 1] = along_m.mean() - along_m  # the first port is leftmost (+y)
     return positions
@@ -760,7 +763,7 @@ def _mounted(
     roll_deg: float = 0.0,
 ) -> Array:
     """Return an array of elements with one pattern in a device that is rotated by yaw and roll."""
-    # the pitch is 0, because the arrays of the paper and of maps point horizontally
+    # the pitch is 0, because the arrays of the paper and of maps have a horizontal boresight
     mount = rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, 0.0, roll_deg]))
     return Array(positions_m, np.radians(np.array(slant_deg)), (pattern or Isotropic(),), mount)
 
@@ -782,8 +785,8 @@ def uav_comparison_array(
     """Return the UAV array of the comparison: 2 x 2 at half a wavelength, rolled by 90 degrees, numbered column first.
 
     Slants alternate between neighbours in both directions. The modem's mounting is not published. With the tower at 12
-    m, ranks of this mounting have a total variation distance of 0.06 and 0.09 from those measured in two flights (K =
-    10). Slants that alternate along the numbering have 0.07 and 0.11.
+    m, ranks simulated with this mounting have a total variation distance of 0.06 and 0.09 from the ranks measured in
+    two flights (K = 10). With slants that alternate along the numbering, it is 0.07 and 0.11.
 
     Parameters
     ----------
@@ -808,7 +811,7 @@ def uav_comparison_array(
 
 
 def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern: Pattern | None = None) -> Array:
-    """Return a horizontal line of vertical elements. The paper's maps use 4 at half a wavelength along the y axis.
+    """Return a horizontal line of vertical elements. The paper's maps use 4 elements, half a wavelength apart, along y.
 
     Parameters
     ----------
@@ -816,7 +819,7 @@ def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern
     spacing_m : float
         Distance between neighbours [m].
     yaw_deg : float
-        Direction of the boresight, counter-clockwise from east [deg]. The line is perpendicular to it.
+        Direction of the boresight, counter-clockwise from east [deg]. The line of elements is perpendicular to it.
     pattern : Pattern, optional
         Pattern of every element. Default: isotropic.
 

@@ -1,6 +1,6 @@
-"""The LLVM that Dr.Jit compiles with: find it, try it in a child process, or return the command that installs it.
+"""The LLVM that Dr.Jit uses to compile: find it, try it in a child process, or return the command that installs it.
 
-Standard library only, so that set-up can use it before anything else works.
+This module uses only the standard library, so that set-up can use it before other packages work.
 
 A trial is necessary. Dr.Jit 1.5 refuses LLVM 14 and loads LLVM 15 and 16, but on machines with AVX-512 these two abort
 the process in the first solver call ("Cannot select: fmaximum"). An abort cannot be caught. The choice is therefore
@@ -28,20 +28,21 @@ from ..common.errors import UsageError
 from ..common.files import cache_folder
 from ..common.versions import version
 
-# Dr.Jit refuses LLVM 14, and LLVM 15 and 16 abort on AVX-512. LLVM 19 and 22 were tested on a machine with AVX-512.
+# Smallest major version of LLVM: Dr.Jit refuses LLVM 14, and LLVM 15 and 16 abort on AVX-512. LLVM 19 and 22 were
+# tested on a machine with AVX-512.
 MINIMUM_MAJOR = 17
 
 # Variable that Dr.Jit reads. A path that the user has set is tried and never replaced.
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
-# Variable with the folders that are searched instead of the system's, separated as in PATH.
+# Variable with the folders that are searched instead of those of the system, separated as in PATH.
 FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
 
-# A trial takes about two seconds. This limit is far longer, so that a slow disk does not look like a library that
-# hangs.
+# Time limit of a trial [s]. A trial takes about two seconds. The limit is far longer, so that a slow disk is not
+# mistaken for a library that hangs.
 _TRIAL_TIMEOUT_S = 300.0
 
-# Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have.
+# The wheel of Dr.Jit needs libatomic.so.1, which a minimal Debian does not contain.
 APT_RUNTIME = "libatomic1"
 
 _FOLDERS = (
@@ -60,7 +61,7 @@ _FOLDERS = (
 _NAME = re.compile(r"libLLVM(?:-(?P<dash>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dot>\d+(?:\.\d+)*))?")
 
 # A program that traces a direct and a reflected path of known length over one ground triangle. It uses the same kinds
-# of instructions as Sionna's solver, so with LLVM 15 on AVX-512 it aborts in the same way. Loading Sionna itself would
+# of instructions as Sionna's solver, so it aborts in the same way with LLVM 15 on AVX-512. Loading Sionna itself would
 # take 2 s.
 TRIAL_PROGRAM = """
 import json, math, sys
@@ -94,7 +95,7 @@ llvm = list(dr.detail.llvm_version()) if "llvm" in sys.argv[1] else []
 print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
 """
 
-# The program for ``doctor`` and ``make setup``, which also report a Sionna RT that cannot be loaded.
+# The program for ``doctor`` and ``make setup``. It also detects a Sionna RT that cannot be loaded.
 _SIONNA_LOADS = f"""{TRIAL_PROGRAM}
 import typing, typing_extensions
 typing.__dict__.setdefault("Self", typing_extensions.Self)
@@ -111,7 +112,7 @@ class Library:
 
     @property
     def label(self) -> str:
-        """``LLVM 19.1 (/usr/lib/...)``."""
+        """Version and path, such as ``LLVM 19.1 (/usr/lib/...)``."""
         return f"LLVM {'.'.join(map(str, self.version)) or '?'} ({self.path})"
 
 
@@ -119,8 +120,8 @@ class Library:
 class Trial:
     """The result of trying one library, or one GPU variant (``library`` is None), in a child process.
 
-    ``reason`` is empty if ``ok``. ``blames_library`` is False if the trial could not even start. ``missing`` then names
-    the shared library that Dr.Jit could not load, if that was the cause.
+    ``reason`` is empty if ``ok``. ``blames_library`` is False if the trial could not start. ``missing`` then names the
+    shared library that Dr.Jit could not load, if that was the cause.
     """
 
     library: Library | None
@@ -147,20 +148,20 @@ def version_in_name(name: str) -> tuple[int, ...] | None:
 
 def _library(path: Path) -> Library | None:
     """Return the file behind a name. Links are followed because ``libLLVM.so`` often points to ``libLLVM.so.19.1``."""
-    # a broken link can remain after a package was removed
-    if path.suffix == ".a" or not path.is_file():  # an LLVM for compiling against contains two hundred static libraries
+    # a broken link may remain after a package was removed
+    if path.suffix == ".a" or not path.is_file():  # a development package contains 200 static libraries
         return None
     versions = [version_in_name(name) for name in (path.resolve().name, path.name)]
     if versions == [None, None]:
         return None
-    # prefer the name with the release: 'libLLVM.so.1' contains the revision of an interface
+    # prefer the name with the release, because the number in 'libLLVM.so.1' is the revision of an interface
     return Library(path.resolve(), max((version for version in versions if version), default=()))
 
 
 def _system_paths() -> list[Path]:
     """Return every file with a libLLVM name that is known to the linker or is in one of the usual folders."""
     paths: list[Path] = []
-    # /sbin is not in the path of a plain Debian user
+    # on Debian, /sbin is not in the path of an ordinary user
     if ldconfig := shutil.which("ldconfig") or shutil.which("/sbin/ldconfig"):
         listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
         paths += [Path(line.rpartition("=> ")[2]) for line in listing.splitlines() if "libLLVM" in line]
@@ -183,7 +184,7 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
     Raises
     ------
     SionnaMissingError
-        If ``DRJIT_LIBLLVM_PATH`` names no file.
+        If the file in ``DRJIT_LIBLLVM_PATH`` does not exist.
     """
     if chosen := environ.get(LIBRARY_VARIABLE):
         path = Path(chosen)
@@ -220,22 +221,22 @@ def _failure(child: subprocess.CompletedProcess[str]) -> str:
         return f"Dr.Jit cannot be loaded, because the system has no {missing}"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
     message = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
-    # a negative code is the signal's number: LLVM aborts
+    # a negative code is the number of a signal, as when LLVM aborts
     how = f"was ended by signal {-child.returncode}" if child.returncode < 0 else f"ended with {child.returncode}"
     return f"the trial {how}: {message[:200]}"
 
 
 def _run_trial(library: Library | None, variant: str, program: str, timeout_s: float) -> tuple[str, dict[str, object]]:
-    """Return the reason of failure (empty if none) and the child's answer."""
+    """Return the reason of a failure (empty if there is none) and the answer of the child."""
     with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-trial-") as scratch:
-        # a kernel in the user's cache would hide that this library cannot compile
+        # use an empty cache: a kernel in the user's cache would hide that this library cannot compile
         environ = {**os.environ, "DRJIT_CACHE_DIR": scratch}
         if library is not None:
             environ[LIBRARY_VARIABLE] = str(library.path)
         try:
             child = subprocess.run(
                 [sys.executable, "-c", program, variant],
-                # Python puts the working folder first in its path: a file mitsuba.py there would be run
+                # Python puts the working folder first in its path, so a file mitsuba.py there would be run
                 cwd=scratch,
                 env=environ,
                 stdin=subprocess.DEVNULL,
@@ -260,7 +261,7 @@ def _run_trial(library: Library | None, variant: str, program: str, timeout_s: f
 
 
 def try_library(library: Library, *, program: str = _SIONNA_LOADS, timeout_s: float = _TRIAL_TIMEOUT_S) -> Trial:
-    """Trace two paths with this library in a child process (about 2 s with Sionna). It never raises or crashes.
+    """Trace two paths with this library in a child process (about 2 s with Sionna). It never raises or crashes itself.
 
     Parameters
     ----------
@@ -268,7 +269,7 @@ def try_library(library: Library, *, program: str = _SIONNA_LOADS, timeout_s: fl
     program : str
         Program that the child runs. It prints one JSON line.
     timeout_s : float
-        The child is ended after this time, and the trial has failed [s].
+        Time after which the child is ended and the trial counts as failed [s].
 
     Returns
     -------
@@ -297,19 +298,20 @@ def _verdict(library: Library | None, reason: str) -> Trial:
 
 
 def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] | None = None) -> list[Trial]:
-    """Try libraries in order (default: :func:`try_library`) until one works. Return the trials, the good one last."""
+    """Try libraries in order (default: :func:`try_library`) until one works. Return all trials, in order."""
     attempt = attempt or try_library
     trials: list[Trial] = []
     for library in libraries:
         trials.append(attempt(library))
-        # stop if the fault is not the library's (e.g. sionna is not installed): another LLVM would fail in the same way
+        # stop if the library is not the cause (for example, sionna is not installed): another LLVM would fail in the
+        # same way
         if trials[-1].ok or not trials[-1].blames_library:
             break
     return trials
 
 
 def _verdict_file(library: Library) -> Path:
-    """Return the file that stores a good trial for this library file, these versions and this processor."""
+    """Return the file that stores a successful trial for this library file, these versions and this processor."""
     try:
         processor = next(
             (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))),
@@ -331,7 +333,7 @@ def _cached_trial(library: Library) -> Trial:
         return Trial(library, True)
     trial = try_library(library, program=TRIAL_PROGRAM)
     if trial.ok:
-        with suppress(OSError):  # an unwritable cache only costs half a second per run
+        with suppress(OSError):  # without a writable cache, each run takes 0.5 s more
             note.parent.mkdir(parents=True, exist_ok=True)
             note.write_text(f"{library.label}\n")
     return trial
@@ -339,7 +341,7 @@ def _cached_trial(library: Library) -> Trial:
 
 @cache
 def _trials() -> tuple[Trial, ...]:
-    """Return the trials that led to this process's choice. They are made once."""
+    """Return the trials that led to the choice of this process. They are made once."""
     return tuple(first_that_works(candidates(), _cached_trial))
 
 
@@ -349,12 +351,12 @@ def prepare_llvm() -> Path:
     Returns
     -------
     Path
-        The library, now also in ``os.environ["DRJIT_LIBLLVM_PATH"]``.
+        The library. Its path is now also in ``os.environ["DRJIT_LIBLLVM_PATH"]``.
 
     Raises
     ------
     SionnaMissingError
-        If no usable LLVM is found. The message contains the line that installs one.
+        If no usable LLVM is found. The message contains the command that installs a usable LLVM.
     """
     trials = _trials()
     if not trials or not trials[-1].ok or trials[-1].library is None:
@@ -380,7 +382,7 @@ INSTALL_AGAIN = "pip install --force-reinstall sionna-rt"
 
 
 def sionna_fails(trials: Sequence[Trial]) -> bool:
-    """Check whether the last trial failed because of Sionna RT or a package that it needs, not because of an LLVM."""
+    """Check whether the last trial failed because of Sionna RT or a package that it needs, not because of LLVM."""
     return bool(trials) and not trials[-1].ok and not trials[-1].blames_library and not trials[-1].missing
 
 
@@ -393,7 +395,7 @@ def remedy(trials: Sequence[Trial]) -> str:
 
 
 def explain(trials: Sequence[Trial]) -> str:
-    """Return one sentence on why none of the tried libraries works."""
+    """Return a sentence with the reason why none of the tried libraries works."""
     if sionna_fails(trials):
         return f"Sionna RT cannot be loaded with any LLVM ({trials[-1].reason})"
     if not trials:
@@ -411,7 +413,7 @@ def os_families() -> set[str]:
         release = platform.freedesktop_os_release()
     except OSError:
         return {platform.system().lower()}
-    # Mint and Pop state in os-release that they are like Ubuntu
+    # ID_LIKE names related distributions: for example, Mint and Pop are like Ubuntu
     return {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
 
 
@@ -435,7 +437,7 @@ def known_to_apt() -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
-# Lines that install an LLVM on distributions without apt, by the family of the distribution.
+# Commands that install LLVM on distributions without apt, by the family of the distribution.
 _LINES = {
     **dict.fromkeys(("fedora", "rhel", "centos"), "sudo dnf install -y llvm-libs libatomic"),
     "arch": "sudo pacman -S --needed llvm-libs",
@@ -445,13 +447,13 @@ _LINES = {
 
 
 def install_line() -> str:
-    """Return the line that installs an LLVM on this machine."""
+    """Return the command that installs LLVM on this machine."""
     families = os_families()
     if families & {"debian", "ubuntu"}:
         known = known_to_apt()
         offered = apt_packages(known)
         if known and not offered:  # Ubuntu 22.04 has only LLVM 15: use the LLVM project's packages
-            # programs that the script calls, which a minimal image does not have
+            # programs that the script calls, and that a minimal image does not contain
             needs = "wget gnupg lsb-release software-properties-common"
             fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
             first = f"sudo apt-get update && sudo apt-get install -y {needs} && {fetch}"

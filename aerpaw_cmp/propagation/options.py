@@ -1,4 +1,4 @@
-"""Options of a replay, in addition to site, link and poses: path search, further losses, cache and progress."""
+"""The options of a replay, in addition to site, link and poses: path search, further losses, cache and progress."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Search:
     """
 
     engine: Engine = "image"
-    # As in the paper's ray tracing.
+    # The value of the paper's ray tracing.
     max_depth: int = 2
     samples: Samples = "auto"
     batch: int = 50
@@ -70,7 +70,8 @@ class Field:
         Sources are (towers, 3), or (poses, 1, 3) for a tower that moves.
         """
         if self.loss is not None and sources_m.ndim == 3:
-            # a loss looks up its source by tower, but here each pose has a separate source
+            # use the pose as the tower, because a loss looks up its source by tower, but here each pose has a separate
+            # source
             paths, sources_m = replace(paths, tower=paths.pose), sources_m[:, 0]
         return None if self.loss is None else self.loss(paths, sources_m, targets_m)
 
@@ -78,7 +79,7 @@ class Field:
 def extent_of(points_m: FloatArray) -> FloatArray:
     """Return two corners (2, 3) of the box of the known points (n, 3), for :class:`Run`."""
     known = points_m[np.isfinite(points_m).all(axis=1)]
-    # two corners determine the same tolerance as all points
+    # two corners are enough, because they determine the same tolerance as all points
     return np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known
 
 
@@ -92,13 +93,14 @@ class Run:
     Parameters
     ----------
     cache_dir : path, optional
-        Folder that stores paths, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for
-        the ``sionna`` engine. The ``image`` engine is faster than a cache and uses one only if this folder is given.
+        Folder in which paths are stored, ``""`` for no cache. Default for the ``sionna`` engine: ``AERPAW_CMP_CACHE``,
+        else ``~/.cache/aerpaw-cmp``. The ``image`` engine is faster than a cache, and uses it only if this folder is
+        given.
     extent_m : (points, 3), optional
-        Points that span all poses of a job, if the poses are a part of it. They set the tolerance of the path search,
-        so that a part has the same paths as in one replay of all poses.
+        Points that span all poses of a job, if the poses are only a part of the job. They determine the tolerance of
+        the path search, so that a part has the same paths as in a replay of all poses.
     progress : callable, optional
-        Called with the share done.
+        Called with the completed share.
     """
 
     cache_dir: str | Path | None = None

@@ -1,12 +1,13 @@
 """The replay of a flight, stage by stage: scene, paths, obstacles, field, levels.
 
-The path table of a replay contains delay, gain per element pair, directions and Doppler of each path separately.
+The path table of a replay contains the delay, the gain per element pair, the directions and the Doppler shift of each
+path.
 
 H is the sum of the gains. The field of a single path is computed as the sum over a set that contains only this path, so
 there is only one formula.
 
 Directions are unit vectors away from the ends. In the site frame, azimuth is counter-clockwise from east and elevation
-is above the horizon. In the array frame (:mod:`aerpaw_cmp.propagation.geometry`) they are measured from the boresight.
+is above the horizon. In the array frame (:mod:`aerpaw_cmp.propagation.geometry`), both are measured from the boresight.
 
 For notebooks, ``trace(site, link, poses)`` returns a :class:`Replay`.
 """
@@ -48,8 +49,7 @@ from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.terrain import on_terrain
 
-# Names of the codes in ``kind``, followed by the names of other kinds of bends. The codes are stored in channel files,
-# so append new kinds at the end.
+# Names of the codes in ``kind``. The codes are stored in channel files, so append new kinds at the end.
 _KINDS = ("line_of_sight", "reflection", "edge")
 
 # Largest bandwidth as a share of the carrier: materials, patterns and foliage are evaluated only at the carrier.
@@ -58,14 +58,14 @@ WIDEST_BAND = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """Ends of the paths of a replay.
+    """The ends of the paths of a replay.
 
     Parameters
     ----------
     link : Link
     poses : Poses
     sources_m : (towers, 3) or (poses, 1, 3)
-        Centres of the tower arrays. The second shape is for one tower that moves.
+        Centres of the tower arrays. The second shape is for a single tower that moves.
     field : Field
         Further losses.
     """
@@ -87,26 +87,26 @@ class Ends:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathTable:
-    """Paths of a replay, one per row, sorted by pose, tower and length.
+    """The paths of a replay, one path per row, sorted by pose, tower and length.
 
     Parameters
     ----------
     pose, tower, number : (paths,) int
-        ``number`` counts the paths of a link.
+        Indices of pose and tower, and number of the path within its link.
     kind : (paths,) int
         Index into ``kinds``.
     via : (paths,) int
-        Index into ``names``: the faces from tower to UAV.
+        Index into ``names``, which contains the faces from tower to UAV.
     gain : (paths, n_rx, n_tx) complex
         Gain of each element pair, with the phase of the carrier.
     length_m : (paths,)
         Length between the centres of the arrays.
     at_tower, at_uav : (paths, 3)
-        Directions in which the path leaves the ends, site frame.
+        Unit vectors in the site frame in which the path leaves the ends.
     turns : (paths,) int
         One digit per corner from tower to UAV: 1 is a reflection, 2 a diffraction. 0 is the line of sight.
     vertices_m : (paths, most, 3)
-        Corners. NaN if unused.
+        Corners of the paths [m]; NaN if unused.
     names, kinds : tuple of str
     """
 
@@ -135,7 +135,7 @@ class PathTable:
         return np.asarray(self.length_m / SPEED_OF_LIGHT_MPS)
 
     def by_link(self, values: AnyArray, ends: Ends, fill: Any = np.nan) -> AnyArray:
-        """Return values per path (paths, ...) as (most paths of a link, poses, towers, ...)."""
+        """Return values per path (paths, ...) in the shape (largest number of paths, poses, towers, ...)."""
         links = len(ends.poses), len(ends.link.tower_arrays)
         out = np.full((self.most, *links, *values.shape[1:]), fill, values.dtype)
         out[self.number, self.pose, self.tower] = values
@@ -144,21 +144,21 @@ class PathTable:
     def doppler_hz(self, carrier_hz: float, velocity_mps: FloatArray, tower_mps: ArrayLike = 0.0) -> FloatArray:
         """Return the Doppler shift (paths,), positive while a path gets shorter.
 
-        ``f = f0 / c (v . k)``, k towards the first corner seen from each end.
+        ``f = f0 / c (v . k)``, summed over both ends, with k towards the first corner seen from the end.
 
         Parameters
         ----------
         carrier_hz : float
         velocity_mps : (poses, 3)
-            Velocity of the UAV: east, north, up.
+            Velocity of the UAV: east, north, up [m/s].
         tower_mps : (poses, 3), optional
-            Velocity of a tower that moves.
+            Velocity of a tower that moves [m/s].
 
         Returns
         -------
         (paths,)
         """
-        # zero velocity for a fixed tower
+        # the default is the zero velocity of a fixed tower
         tower = np.broadcast_to(unmasked(tower_mps), velocity_mps.shape)
         closing = np.einsum("ni,ni->n", velocity_mps[self.pose], self.at_uav)
         closing += np.einsum("ni,ni->n", tower[self.pose], self.at_tower)
@@ -180,7 +180,7 @@ class PathTable:
 def path_table(
     contributions: tuple[Any, ...], faces: Faces, ends: Ends, counts: AnyArray, names: dict[str, int]
 ) -> PathTable:
-    """Return paths of a replay, each with its own gain.
+    """Return the table of the paths of a replay, each with its own gain.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def path_table(
     counts : (poses, towers) bool
         Links that have a channel. Paths of other links are omitted.
     names : dict of str to int
-        Number of each sequence of faces found at earlier poses. New sequences are added.
+        Number of each sequence of faces that was found at earlier poses. New sequences are added.
 
     Returns
     -------
@@ -210,7 +210,7 @@ def path_table(
         unique, via = np.unique(item.touched, axis=0, return_inverse=True)
         texts = [", ".join(labels[i] for i in row if i >= 0) for row in unique.tolist()]
         codes = np.array([names.setdefault(text, len(names)) for text in texts], dtype=np.int64)
-        # use the array centres: delays and directions are per path, but gains are per element pair
+        # use the array centres, because delays and directions are per path, although gains are per element pair
         places = sources_of(lines, ends.sources_m), lines.vertices_m, ends.poses.position_m[lines.pose]
         away = list(legs(*places))
         back = next(legs(places[2], lines.vertices_m[:, ::-1], places[0]))  # the first leg from the UAV
@@ -270,9 +270,9 @@ def impulse_responses(
     Returns
     -------
     a : (rx, rx_ant, tx, tx_ant, paths, times) complex
-        Coefficients with the phase of the carrier, like Sionna's baseband equivalents. Zero if there is no path.
+        Coefficients with the phase of the carrier, like the baseband equivalents of Sionna. Zero if there is no path.
     tau : (rx, tx, paths)
-        Delay [s]; zero where there is no path.
+        Delay [s]; zero if there is no path.
     """
     turned = table.gain[..., None]
     if velocity_mps is not None:
@@ -305,7 +305,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
 
     Notes
     -----
-    ``H(f0 + f) = sum_p a_p exp(-j 2 pi f tau_p)`` with gains of the carrier and delays of the array centres.
+    ``H(f0 + f) = sum_p a_p exp(-j 2 pi f tau_p)`` with the gains at the carrier, and the delays between array centres.
     """
     offsets = unmasked(offsets_hz)
     check_band(float(np.ptp(offsets)) if len(offsets) else 0.0, ends.link.carrier_hz)
@@ -335,7 +335,7 @@ def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
     >>> subcarriers_hz(4.0, 4).tolist()
     [-2.0, -1.0, 0.0, 1.0]
     """
-    # like np.fft.fftshift: with an even count the lowest frequency has no positive counterpart
+    # as with np.fft.fftshift, for an even count the lowest frequency has no positive counterpart
     return np.asarray((np.arange(count) - count // 2) * (bandwidth_hz / count))
 
 
@@ -345,16 +345,16 @@ PER_LINK = ("rss_dbm", "rss_power_dbm", "h", "has_path")
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Replay:
-    """Result of a replay.
+    """The result of a replay.
 
     Parameters
     ----------
     rss_dbm : (poses, towers)
-        Coherent: from ``|H|^2``, see :func:`aerpaw_cmp.propagation.field.sum.rss_dbm`. NaN without a path.
+        Coherent level, from ``|H|^2`` (:func:`aerpaw_cmp.propagation.field.sum.rss_dbm`). NaN if there is no path.
     rss_power_dbm : (poses, towers)
         Level from the sum of the paths' powers.
     h : (poses, towers, n_rx, n_tx) complex128
-        Zero without a path.
+        Channel matrices, zero if there is no path.
     has_path : (poses, towers) bool
     contributions : tuple
         Paths that add up to H and both levels: reflections and lines of sight, then the paths of each requested further
@@ -370,9 +370,9 @@ class Replay:
     omitted : list of Omission
         Parts that were not modelled. ``left_out`` contains them as sentences for the report.
     towers : tuple of str
-        Order of the tower axis.
+        Names of the towers, in the order of the tower axis.
     from_cache : bool
-        Whether the paths came from the cache.
+        True if the paths came from the cache.
     samples : int
         Rays per tower; 0 for an engine without rays.
     samples_reason : str
@@ -400,12 +400,12 @@ class Replay:
 
     @property
     def paths(self) -> PathSet:
-        """Reflections and lines of sight."""
+        """The lines of sight and reflected paths."""
         return self.contributions[0]  # type: ignore[no-any-return]
 
     @property
     def further(self) -> tuple[Further, ...]:
-        """Paths of further kinds."""
+        """The paths of further kinds."""
         return self.contributions[1:]
 
     def level_dbm(self, summed: Literal["coherent", "power"]) -> FloatArray:
@@ -414,7 +414,7 @@ class Replay:
 
     @property
     def left_out(self) -> list[str]:
-        """Sentences on what was not modelled."""
+        """Sentences about the parts that were not modelled."""
         # omissions with a count of zero do not need a sentence
         return [str(item) for item in self.omitted if 0 not in item.counts[:1]]
 
@@ -499,7 +499,7 @@ def replay(
     ----------
     site : Site
     link : Link
-        Its ``tower_arrays`` name towers of the site.
+        Link. Its ``tower_arrays`` name towers of the site.
     poses : Poses
     search : Search
         Options that determine the paths, such as engine and depth.
@@ -522,7 +522,7 @@ def replay(
         raise UsageError(f"unknown engine {search.engine!r}", expected="'image' or 'sionna'")
     poses, notes = within_reach(site, poses)
     scene = Scene.of(site, link, poses)
-    # a moving tower has links only with its own poses
+    # exclude links that are not searched: each position of a moving tower has links only with its own poses
     if search.links is not None:
         scene = replace(scene, excluded=scene.excluded | ~search.links)
     notes += buried_towers(site, link)
@@ -530,7 +530,7 @@ def replay(
     choice = chosen_samples(scene, link, poses, search, cache)
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
-    # report damaged cache entries, which explain a long search: the results are correct
+    # report damaged cache entries, because they explain a long search. The results are correct.
     notes += map(Omission, cache.warnings) if cache else []
     # use the scene without terrain planes, because these paths reflect off level ground
     further = further_paths(site, scene, link, poses, search, field)
@@ -573,7 +573,7 @@ def passed(
     Returns
     -------
     scene : Scene
-        Scene with the terrain planes that a path meets.
+        Scene with the terrain planes at which a path is reflected.
     paths : PathSet
     notes : list of Omission
         Searches that were stopped, and links that were skipped.
@@ -585,7 +585,7 @@ def passed(
     notes += [Omission("paths end at the terrain of the elevation model", (lost, len(level)))]
     paths = level.select(clear) if lost else level
     if len(shaped):
-        # pass no faces: adjacent terrain planes are not repeated faces
+        # pass None instead of the faces: paths over adjacent terrain planes are not duplicates
         paths = mirror.merge([paths, shaped], search.max_depth, None)
     return scene, paths, notes
 
@@ -593,7 +593,7 @@ def passed(
 def further_paths(
     site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field
 ) -> list[tuple[Further, Fields]]:
-    """Find the paths of the requested further kinds, and what they add to H and to the powers.
+    """Find the paths of the requested further kinds, and their contributions to H and to the powers.
 
     Parameters
     ----------
@@ -635,10 +635,10 @@ def _shaped_ground(
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
-    """Return which paths (paths,) the elevation model does not block.
+    """Return a mask (paths,) of the paths that the elevation model does not block.
 
-    For a line of sight or a reflection off level ground the direct line between the ends decides. For a path over walls
-    alone each of its segments decides.
+    For a line of sight or a reflection off level ground, the direct line between the ends must be free. For a path over
+    walls only, each segment must be free.
     """
     if site.dem is None or len(paths) == 0:
         return np.ones(len(paths), dtype=np.bool_)
@@ -657,11 +657,11 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
 def _channels(
     scene: Scene, link: Link, poses: Poses, paths: PathSet, further: Sequence[Fields], field: Field
 ) -> tuple[Fields, BoolArray]:
-    """Return H and powers with the parts of further kinds, and which links (poses, towers) have a path."""
+    """Return H and powers, including further kinds of paths, and a mask of the links (poses, towers) with a path."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
-    # a blocked path adds zero to H; only the flag distinguishes it from a path that fades
+    # a blocked path adds zero to H, so only this mask distinguishes it from a path in a fade
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss means an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
     for item in further:
@@ -672,11 +672,11 @@ def _channels(
 
 
 def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray, FloatArray]:
-    """Return levels (poses, towers) of H and of the summed powers. Below the noise floor clear H and ``has_path``."""
+    """Return levels (poses, towers) of H and of the summed powers. Below the noise floor, clear H and ``has_path``."""
     sent, floor = link.transmit_power_dbm, link.noise_floor_dbm
     level_dbm = rss_dbm(mean_pair_power(fields.h), sent, floor)
     above_floor = np.isfinite(level_dbm)
-    # below the noise floor the channel is unknown, so there is no rank
+    # below the noise floor, the channel is unknown, so there is no rank
     fields.h[~above_floor] = 0.0
     has_path &= above_floor
     return level_dbm, rss_dbm(fields.power, sent, floor)
@@ -698,12 +698,12 @@ def trace(
     Parameters
     ----------
     site : Site, str or path
-        A loaded site, the name of a packaged one (``"lake_wheeler"``), or a site.yaml.
+        A loaded site, the name of a packaged site (``"lake_wheeler"``), or a site.yaml.
     link : Link
         Carrier, arrays and power. ``link.tower_arrays`` names towers of the site.
     poses : Poses or array_like, (poses, 3)
-        Poses, or positions east, north and up of the site's origin [m]. A UAV at a plain position is level, with its
-        nose to the east.
+        Poses, or positions east, north and up of the site's origin [m]. For positions, the UAV is level, with its nose
+        to the east.
     engine : {"image", "sionna"}
         The exact image method, or Sionna RT's PathSolver as path finder. Fields are computed in float64 with both
         engines.

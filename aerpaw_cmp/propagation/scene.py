@@ -30,7 +30,7 @@ class Scene:
     excluded : (towers, poses) bool
         Links without a path: an end inside a building or under the ground.
     surfaces : Surfaces or None
-        The faces' materials and triangles, for a site with a scene of triangles. They replace ground planes.
+        Materials and triangles of the faces, for a site with a scene of triangles. They replace ground planes.
     """
 
     faces: Faces
@@ -41,7 +41,7 @@ class Scene:
 
     @classmethod
     def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
-        """Return the scene of a site as the towers of a link see it."""
+        """Return the scene of a site for the towers of a link."""
         names = tuple(link.tower_arrays)
         unknown = [name for name in names if name not in site.towers]
         if unknown:
@@ -52,7 +52,7 @@ class Scene:
             )
         surfaces, towers = surfaces_of(site), [site.towers[name] for name in names]
         sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
-        # exclude such links before the search, which would otherwise try every face for them
+        # exclude links with an end inside a building before the search, which would otherwise try every face for them
         excluded = inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         if surfaces is not None:
             usable = np.ones((len(names), len(surfaces)), dtype=np.bool_)
@@ -60,12 +60,12 @@ class Scene:
         faces = site_faces(site, names)
         ground = np.array([tower.ground_m for tower in towers])
         is_ground = faces.solid < 0
-        # each tower sees only the ground plane at its foot; all towers share walls and roofs
+        # each tower uses only the ground plane at its foot, but all walls and roofs
         usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
-        # a pose below a tower's plane but above the lowest ground, or above the terrain, is not buried
+        # a pose below the plane of a tower, but above the lowest ground or the terrain, is not buried
         lowest = np.minimum(ground, 0.0)[:, None]
         if site.dem is not None:
-            # use fmin: outside the elevation model (NaN) the tower's plane is the limit
+            # use fmin: outside the elevation model (NaN), the plane of the tower is the limit
             lowest = np.fmin(lowest, site.dem.ground_m(*poses.position_m[:, :2].T))
         return cls(faces, sources, usable, excluded | (poses.position_m[:, 2] < lowest))
 
@@ -75,19 +75,19 @@ class Scene:
 
 
 def surfaces_of(site: Site) -> Surfaces | None:
-    """Return the faces of the site's scene of triangles and of its buildings. None if the site has no such scene."""
+    """Return the faces of the site's scene of triangles and its buildings. None without a scene of triangles."""
     if site.scene is None:
         return None
     scene = site.scene
     for building in site.buildings:
-        # scenes of triangles use one formula for hiding and reflecting, and prisms use another
+        # convert prisms to triangles, because the search in a scene of triangles needs triangles
         scene = added(scene, *building_mesh(building), building.name, material(building.material).name)
     return _merged(scene)
 
 
 @lru_cache(maxsize=2)
 def _merged(scene: TriangleScene) -> Surfaces:
-    """Return the faces of a scene. The same scene is merged once."""
+    """Return the merged faces of a scene. The same scene is merged only once."""
     if reason := why_missing():
         raise UsageError(
             f"the site is a scene of triangles, but {reason}",
@@ -99,8 +99,8 @@ def _merged(scene: TriangleScene) -> Surfaces:
     return merged(scene)
 
 
-# Reject poses farther than this from every tower [m]: they do not belong to the site. It is the radio horizon of a UAV
-# at 600 m; a row at 0, 0 degrees is thousands of kilometres away.
+# Reject poses farther than this from every tower [m]: they do not belong to the site. The distance is the radio horizon
+# of a UAV at 600 m. A row at 0, 0 degrees is thousands of kilometres away.
 REACH_M = 100_000.0
 
 
@@ -148,7 +148,7 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
 
 
 def buried_towers(site: Site, link: Link) -> list[Omission]:
-    """Report towers whose antenna is inside a building: a wrong footprint would look like a tower without signal."""
+    """Report towers whose antenna is inside a building, because a wrong footprint would look like a missing signal."""
     lines = []
     names = list(link.tower_arrays)
     places = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)

@@ -1,13 +1,13 @@
-"""An audit of one engine by the other on a sample of links, and of its fields by two references.
+"""An audit of one engine by the other on a sample of links, and of the fields of the replay by two references.
 
-The field of a replay is checked by Sionna's own coefficients and by a second implementation.
+The fields of a replay are compared with Sionna's own coefficients and with a second implementation.
 
-1. *Sionna* traces the audited links again and returns a complex coefficient for each path. It uses one element at
-   each array centre, both slants, and its own materials, patterns and rotations. The results are float32: entries must
-   agree within ``_ENTRY_TOLERANCE`` of the strongest, phases within ``_PHASE_TOLERANCE_RAD`` on paths shorter than
-   ``_PHASE_RANGE_M``.
-2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the settings: their paths,
-   H of every element pair with foliage, RSS and rank. Both are float64, so only rounding may differ.
+1. *Sionna* traces the audited links again and returns a complex coefficient for each path. Sionna uses an element at
+each array centre with both slants, and its own materials, patterns and rotations. The results are float32: entries must
+agree within ``_ENTRY_TOLERANCE`` of the strongest entry, and phases within ``_PHASE_TOLERANCE_RAD`` on paths shorter
+than ``_PHASE_RANGE_M``. 2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the
+settings: their paths, H of every element pair with foliage, RSS and rank. Both implementations use float64, so only
+rounding may differ.
 """
 
 from __future__ import annotations
@@ -40,14 +40,15 @@ if TYPE_CHECKING:
     from ..search.sionna import Coefficients
 
 
-# Tolerance of an entry, relative to the strongest of a path's four entries. The float32 errors in rotations, patterns
-# and Fresnel coefficients are about 5e-4.
+# Tolerance of an entry, relative to the strongest of the four entries of a path. The float32 errors in rotations,
+# patterns and Fresnel coefficients are about 5e-4.
 _ENTRY_TOLERANCE = 3e-3
 
 # Sionna's reflection points are barycentric on large triangles, and float32 has 24 bits for a coordinate.
 _FLOAT32_ULP = 2.0**-22
 
-# Within ``_PHASE_RANGE_M`` float32 moves a reflection point off its plane by at most 1e-4 m: 7e-3 rad at 3.4 GHz.
+# Within ``_PHASE_RANGE_M``, float32 shifts a reflection point off its plane by at most 1e-4 m, which is 7e-3 rad at 3.4
+# GHz.
 _PHASE_TOLERANCE_RAD = 0.01
 
 _PHASE_RANGE_M = 300.0
@@ -55,18 +56,18 @@ _PHASE_RANGE_M = 300.0
 # Tolerance for the coherent RSS of a link whose paths are all shorter than ``_PHASE_RANGE_M`` [dB].
 _LINK_TOLERANCE_DB = 0.1
 
-# Tolerance for H against the second implementation, relative to the root of the link's total path power. Both are
-# float64.
+# Tolerance for H against the second implementation, relative to the root of the total path power of the link. Both
+# implementations use float64.
 _EXACT_TOLERANCE = 1e-6
 
-# A path whose existence changes when an edge moves by this distance may differ in float32.
+# If a shift of an edge by this distance creates or removes a path, float32 may also do so.
 _SIONNA_MARGIN_M = 2e-3
 
-# Poses per replay for the second implementation.
-# Each link takes about 0.1 s, because the second implementation computes one element pair after the other.
+# Number of poses per replay for the second implementation. Each link takes about 0.1 s, because element pairs are
+# computed one after the other.
 REFERENCE_LINKS = 8
 
-# Patterns that Sionna and this package share, under the same names.
+# Patterns that Sionna and this package have under the same names.
 _SIONNA_PATTERNS = ("iso", "hw_dipole", "tr38901")
 
 
@@ -122,7 +123,7 @@ def against_reference(
     ks: Sequence[float],
     max_depth: int,
 ) -> FieldAudit:
-    """Compute a few links of a replay with the second implementation, and compare.
+    """Compute a few links of a replay with the second implementation, and compare the results.
 
     Parameters
     ----------
@@ -149,8 +150,7 @@ def against_reference(
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
             stands = in_woods[mine].any()
-            # the second implementation supports only level ground and no media: reporting that is better than a false
-            # failure
+            # the second implementation supports only level ground and no media. Report that instead of a false failure.
             if beyond[mine].any() or stands:
                 total += FieldAudit(not_covered=(_STANDS if stands else _ON_TERRAIN,))
                 continue
@@ -242,9 +242,9 @@ class _OneLink:
         phantom = doubtful = missing = 0
         ground = self.reference.site.towers[self.replay.towers[self.tower]].ground_m
         gap = math.dist(self.target, self.reference.source)
-        # a pose is out of reach only if it is too far from every tower, not only from this tower
+        # the replay excludes a pose only if it is too far from every tower, not only from this tower
         nearest = min(math.dist(self.target, tower.position_m) for tower in self.reference.site.towers.values())
-        # a target that is buried, in the near field or out of reach must have no path in the replay
+        # the replay must not have a path to a target that is buried, in the near field or out of reach
         nowhere = self.target[2] < min(ground, 0.0) or gap < 0.01 or nearest > 1e5
         for path in self.mine:
             sequence = self.sequence(path)
@@ -255,7 +255,7 @@ class _OneLink:
         if phantom:
             failures.append(f"{self.name}: {counted(phantom, 'path')} that cannot exist")
         if complete and not nowhere:
-            # None: there are too many sequences to try; the paths of the replay are still judged
+            # with None, there are too many sequences to try, but the paths of the replay are still checked
             for sequence in self.reference.sequences(self.target, max_depth) or ():
                 # count a path as missing only if it certainly exists
                 if self.reference.verdict(sequence, self.target) and (key := _key(sequence)) not in keys:
@@ -285,14 +285,14 @@ class _OneLink:
         """Compare H, RSS and rank of the replay with the expected ``h`` and total path ``power`` of a link."""
         link, ours, failures = self.reference.link, self.replay.h[self.row, self.tower], []
         over = _decibel(float((np.abs(h) ** 2).mean())) + link.transmit_power_dbm - link.noise_floor_dbm
-        # this close to the noise floor, rounding decides whether there is a channel
+        # do not judge a level this close to the noise floor, because rounding decides whether there is a channel
         if abs(over) < 1e-3:
             return FieldAudit(doubtful=1)
         if over < 0:  # below the receiver's floor: no channel
             h = np.zeros_like(h)
         if ours.shape != h.shape:
             return FieldAudit(failures=(f"{self.name}: H is {ours.shape}, expected {h.shape}",))
-        # relative to the path powers, not to H: H is small in a fade, but its error is not
+        # take the error relative to the path powers, not to H: in a fade, H is small, but its error is not
         size = math.sqrt(power) or 1e-30
         under = _decibel(power) + link.transmit_power_dbm < link.noise_floor_dbm
         error = float(np.abs(ours - h).max()) / size
@@ -300,7 +300,7 @@ class _OneLink:
             failures.append(f"{self.name}: the relative error of H is {error:.2g}")
         worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
         for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
-            # the coherent level is computed from H, and the other level from the path powers
+            # compute the coherent level from H, and the other level from the path powers
             off = _level_error(float(level[self.row, self.tower]), value, link.transmit_power_dbm, size)
             if off > 1e-3:
                 failures.append(f"{self.name}: RSS differs by {off:.2g} dB")
@@ -319,7 +319,7 @@ def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float
     sigma = np.linalg.svd(expected, compute_uv=False)
     if not sigma[0] > 0:
         return any(int(channel_rank(ours, k)) for k in ks)
-    # rounding decides whether a singular value at the threshold counts
+    # skip thresholds at which rounding decides whether a singular value counts
     clear = [k for k in ks if not (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()]
     return any(int(channel_rank(ours, k)) != int((sigma > sigma[0] / k).sum()) for k in clear)
 
@@ -346,7 +346,7 @@ def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray
     normal, offset = faces.normal[face], float(faces.offset_m[face])
     solid = int(faces.solid[face])
     point = tuple(vertex.tolist())
-    # compare plane and building, because the replay has its own face numbers
+    # compare plane and building, because the replay numbers faces differently
     same = [
         m
         for m in reference.mirrors
@@ -460,7 +460,7 @@ def against_sionna(
 
 
 def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
-    """Return the link with two crossed elements at each array's centre, and the patterns that Sionna does not have.
+    """Return the link with two crossed elements at each array centre, and the patterns that Sionna does not have.
 
     The elements have the pattern of the array's first element. The vertical and the horizontal element determine the
     field of every slant.
@@ -485,20 +485,20 @@ def _paths_against_sionna(
 ) -> FieldAudit:
     """Compare paths with the same rows of Sionna's ``theirs``.
 
-    ``chosen`` (poses,) contains the poses' numbers in the replay.
+    ``chosen`` (poses,) contains the numbers of the poses in the replay.
     """
     count = len(ours)
     if not count:
         return FieldAudit()
-    # each path gets a separate pose: H of a pose with one path is the coefficient of that path
+    # give each path a separate pose, because H of a pose with a single path is the coefficient of that path
     alone = replace(ours, pose=np.arange(count))
     spots = few[ours.pose]
     h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
     turn = (h * theirs.gain.conj()).sum(axis=(1, 2))
-    # a coefficient of zero has no phase
+    # a coefficient of zero has no phase, so do not rotate it
     turn = np.where(turn == 0.0, 1.0, turn)
     phase, near = np.abs(np.angle(turn)), theirs.length_m < _PHASE_RANGE_M
-    # float32 has too few digits for a weak entry, so errors are relative to the path's strongest entry
+    # float32 has too few digits for a weak entry, so take errors relative to the strongest entry of the path
     strongest = np.abs(theirs.gain).max(axis=(1, 2))
     # remove the phase, which is compared separately, because float32 is too coarse for it beyond 1 km
     aligned = h * (turn.conj() / np.abs(turn))[:, None, None]
@@ -538,13 +538,13 @@ def _turned_by_float32(
 ) -> FloatArray:
     """Return angles (paths,) [rad] by which the rounding of Sionna's reflection points rotates polarisations.
 
-    A point nearly above an end, seen along a face's normal or a device's axis, is at a small distance from that axis.
-    Its shift over this distance rotates the plane of incidence, or the basis of the pattern. Shifts larger than the
-    rounding of float32 are not tolerated.
+    A reflection point nearly above an end of the path, seen along the normal of a face or the axis of a device, is at a
+    small distance from that axis. The shift of the point divided by this distance rotates the plane of incidence, or
+    the basis of the pattern. Shifts larger than the rounding of float32 are not tolerated.
     """
     mounts = np.stack([array.mount for array in probe.tower_arrays.values()])
     ends = scene.sources_m[ours.tower], spots.position_m
-    # use the size of the ground in search.sionna, because float32 rounds coordinates in proportion to it
+    # use the size of the ground in search.sionna, because float32 rounds coordinates in proportion to this size
     reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)
     shift = np.nan_to_num(np.abs(theirs.paths.vertices_m - ours.vertices_m)).max(axis=(1, 2), initial=0.0)
     axes = [mounts[ours.tower][:, :, 2], (spots.rotation @ probe.uav_array.mount)[:, :, 2]]
@@ -571,7 +571,7 @@ def _link_error(
         sums.append((np.abs(total) ** 2).mean(axis=(1, 2)))
     alone = np.bincount(link, weights=(np.abs(h) ** 2).mean(axis=(1, 2)), minlength=poses * towers)
     all_near = np.bincount(link, weights=~near, minlength=poses * towers) == 0
-    # in a fade of 20 dB an error of 0.01 rad is a tenth of the remaining field
+    # exclude deep fades: in a fade of 20 dB, an error of 0.01 rad is a tenth of the remaining field
     good = all_near & (sums[1] > 0.01 * alone) & (alone > 0)
     return float(np.abs(10 * np.log10(sums[0][good] / sums[1][good])).max(initial=0.0))
 
@@ -579,7 +579,7 @@ def _link_error(
 def _lacking(
     site: Site, replay: Replay, theirs: PathSet, faces: Faces, rows: IntArray, few: Poses, expected: Expected
 ) -> FieldAudit:
-    """Count paths that only Sionna has: missing if they certainly exist, else doubtful because Sionna uses float32."""
+    """Count paths that only Sionna has: missing if they certainly exist, otherwise doubtful (Sionna uses float32)."""
     # use a wider margin, because float32 may differ within 2 mm
     verdicts = _verdicts(site, replay, theirs, faces, few, rows, expected, _SIONNA_MARGIN_M)
     missing = verdicts.count(True)
@@ -588,7 +588,7 @@ def _lacking(
     return FieldAudit(missing_paths=missing, doubtful=doubtful, failures=failures)
 
 
-# Rays of the solve for Sionna's own coefficients. The paths themselves were searched before with all rays.
+# Number of rays of the run for Sionna's own coefficients. The paths were searched before with the full number of rays.
 _FIELD_SAMPLES = 100_000
 
 # Singular-value ratios of the paper.
@@ -602,12 +602,12 @@ class Difference:
     Parameters
     ----------
     missing_paths, extra_paths : int
-        Paths only in the reference, and paths only in the engine that is checked.
+        Number of paths that only the reference has, and number of paths that only the checked engine has.
     reference_paths : int
     rss_max_error_db, rss_rms_error_db : float
-        Errors of the coherent RSS over links that both cover. NaN if there is no such link.
+        Errors of the coherent RSS over links that both engines cover. NaN if there are none.
     coverage_differs : int
-        Number of links that only one of the two covers.
+        Number of links that only one of the two engines covers.
     rank_disagreement : dict of float to float
         Share of links whose rank differs, for each K. A link without a path has rank 0.
     """
@@ -631,10 +631,10 @@ class Audit(Difference):
     links : int
         Pose-tower pairs checked.
     seconds, reference_seconds : float
-        Time of the replay (all its links) and of the reference on the checked links. If the reference's paths came from
-        the cache, the time of their original search counts.
+        Time of the replay (all its links) and of the reference on the checked links. If the paths of the reference came
+        from the cache, the time of their original search is included.
     samples : int
-        Rays per tower that PathSolver shot, in the replay or the reference.
+        Number of rays per tower that PathSolver used, in the replay or in the reference.
     samples_reason : str
         Reason for this number of rays.
     field : FieldAudit or None
@@ -662,13 +662,14 @@ class Second:
     links : int or None
         About this number of pose-tower pairs, with poses evenly spread over the flight. None checks all.
     expected : Expected, optional
-        Settings, read a second time. If given, fields are checked too (:mod:`aerpaw_cmp.propagation.check.audit`).
+        Settings, read a second time. If they are given, fields are checked, too
+        (:mod:`aerpaw_cmp.propagation.check.audit`).
     ks : sequence of float
         Singular-value ratios of the rank comparison.
     reference_links : int
         Number of poses that the second implementation computes.
     known : dict
-        Sionna's own coefficients by the digest of their inputs: channels with the same tower and track share them.
+        Sionna's own coefficients by the digest of their inputs. Channels with the same tower and track share these.
     """
 
     reference: Engine | None = None
@@ -683,7 +684,7 @@ def audit(
     site: Site, link: Link, poses: Poses, replay: Replay,
     search: Search = Search(), field: Field = Field(), run: Run = Run(), second: Second = Second(),
 ) -> Audit:  # fmt: skip
-    """Check a replay by another engine, on the whole scene.
+    """Check a replay by another engine, in the complete scene.
 
     Parameters
     ----------
@@ -694,7 +695,7 @@ def audit(
     search, field, run
         The same as for the replay.
     second : Second
-        The other engine, how many links, and what the second implementation checks.
+        The other engine, the number of links, and the checks of the second implementation.
 
     Returns
     -------
@@ -709,7 +710,7 @@ def audit(
     rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)
     fields, ks, expected = None, second.ks, second.expected
     if expected is not None:
-        # open sheets need a separate formula, which the second implementation does not have
+        # triangles may be open sheets, for which the second implementation does not have a formula
         fields = FieldAudit(not_covered=("the second implementation, which supports only prisms, not triangles",))
         if site.scene is None:
             few_kinds = spread_over_paths(replay, chosen, second.reference_links)
@@ -726,7 +727,7 @@ def audit(
         seconds=replay.seconds,
         samples=max(checked.samples, replay.samples),
         samples_reason=checked.samples_reason or replay.samples_reason,
-        # a reference from the cache took no time now: report the time of its original search
+        # if the reference comes from the cache, report the time of its original search
         reference_seconds=checked.seconds + (checked.search_seconds if checked.from_cache else 0.0),
     )
 
@@ -754,7 +755,7 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
     Returns
     -------
     Difference
-        Paths that only one of the two has, errors of the level [dB], links in coverage of only one, and ranks that
+        Paths that only one replay has, errors of the level [dB], links that only one replay covers, and ranks that
         differ.
     """
     keys = _keyed(_of_chosen(replay.paths, chosen)[1], replay.faces, reference.paths, reference.faces)
@@ -766,7 +767,7 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
         missing_paths=len(theirs - ours),
         extra_paths=len(ours - theirs),
         reference_paths=len(theirs),
-        # NaN if nothing was compared: zero would mean perfect agreement
+        # NaN if no link was compared, because zero would mean perfect agreement
         rss_max_error_db=float(error.max()) if error.size else math.nan,
         rss_rms_error_db=float(np.sqrt((error**2).mean())) if error.size else math.nan,
         coverage_differs=int((np.isfinite(level) != np.isfinite(reference.rss_dbm)).sum()),
@@ -792,7 +793,7 @@ def _of_chosen(paths: PathSet, chosen: IntArray) -> tuple[IntArray, PathSet]:
 
 def _keyed(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[list[_Key], list[_Key]]:
     """Return pose, tower and planes of each path of two sets. Coplanar faces are the same mirror."""
-    # number the planes of both together, because a replay numbers its terrain planes by its own poses
+    # number the planes of both sets together, because each replay numbers terrain planes in the order of its own poses
     plane = planes_of(joined(our_faces, their_faces))
     return plane_keys(ours, plane[: len(our_faces)]), plane_keys(theirs, plane[len(our_faces) :])
 

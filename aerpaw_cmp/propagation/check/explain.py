@@ -1,9 +1,8 @@
 """The composition of the paths of one link, term by term, and reasons why other paths do not exist.
 
-The level of a path is the mean, over element pairs, of the power that it adds. Each term is the ratio [dB] of that
-mean after and before a step (tower's antenna, reflections, spreading, UAV's antenna, polarisation). The terms
-therefore add up to the level for any arrays. With one element at both ends they are the gains and losses of the
-textbook.
+The level of a path is the mean of its power over element pairs. Each term is the ratio [dB] of that mean after and
+before a step (tower's antenna, reflections, spreading, UAV's antenna, polarisation). The terms therefore add up to the
+level for any arrays. With a single element at each end, the terms are the gains and losses of textbooks.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from ..search.mirror import Occlusion, retraced, scene_tolerance_m
 class Bounce:
     """One reflection of a path.
 
-    ``te_db`` and ``tm_db`` are the magnitudes of its coefficients, and ``loss_db`` is the loss of power.
+    ``te_db`` and ``tm_db`` are the magnitudes of the reflection coefficients, and ``loss_db`` is the loss of power.
     ``incidence_deg`` is measured from the normal.
     """
 
@@ -56,7 +55,8 @@ class ExplainedPath:
     """One path with its geometry, losses and level.
 
     Azimuths are clockwise from north. ``arrival`` is the direction from the UAV to the last reflection or the tower.
-    ``level_dbm`` is the sum of ``terms_db`` and the transmit power. ``phase_deg`` is that of the first element pair.
+    ``level_dbm`` is the sum of ``terms_db`` and the transmit power. ``phase_deg`` is the phase of the first element
+    pair.
     """
 
     depth: int
@@ -75,7 +75,7 @@ class ExplainedPath:
 
     @property
     def words(self) -> str:
-        """Names of the faces that the path meets, from tower to UAV."""
+        """Names of the faces at which the path is reflected, from tower to UAV."""
         return ", ".join(bounce.face for bounce in self.bounces) or "line of sight"
 
     def as_dict(self) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def explain_paths(
     link : Link
         The link with only that tower.
     further_db : dict of str to (paths,)
-        Positive losses [dB] by name, in addition to those that the field includes.
+        Positive losses [dB] by name, in addition to the losses that the field includes.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def explain_paths(
     for row in range(len(paths)):
         recorded: list[tuple[str, AnyArray]] = []
         single = paths.select(np.array([row]))
-        # the link has only that tower, so its number is 0 here
+        # the link has only this tower, so the number of the tower is 0 here
         columns = geometry(replace(single, tower=np.zeros(1, np.int64)), faces, table, source_m[None], poses, link)
         ends = pattern_ends(columns, elements, link)
         field = amplitudes(columns, elements, ends, wavelength, lambda *step: recorded.append(step))  # noqa: B023
@@ -121,7 +121,7 @@ def explain_paths(
 
 
 def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
-    """Describe the paths of further kinds of one link, strongest first, with their levels before foliage.
+    """Describe the further kinds of paths of one link, strongest first, with their levels before foliage.
 
     Parameters
     ----------
@@ -157,12 +157,13 @@ def _explained(
     waves = [value for name, value in recorded if name == "wave"]
     spreading = next(value for name, value in recorded if name == "spreading") ** 2
     uav = next(value for name, value in recorded if name == "uav")
-    # spreading and the UAV's pattern multiply the power, and the remaining ratio to the received power is polarisation
+    # spreading and the UAV's pattern multiply the power. The remaining ratio to the received power is the polarisation
+    # term.
     powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, np.abs(field) ** 2]
     mean = np.array([1.0, *(float(power.mean()) for power in powers)])
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = db_from_power(mean[1:]) - db_from_power(mean[:-1])
-    # after a step to zero power, later steps have no effect; 0 / 0 would be NaN
+    # after a step to zero power, later steps are 0 dB, where 0 / 0 would be NaN
     steps = np.where(mean[1:] > 0.0, steps, np.where(mean[:-1] > 0.0, -np.inf, 0.0))
     depth = int(path.depth[0])
     names = [
@@ -177,7 +178,7 @@ def _explained(
     corners = np.concatenate([source_m[None], path.vertices_m[0, :depth], target_m[None]])
     legs = np.diff(corners, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
-    # directions away from both ends
+    # both directions point away from the ends
     departure, arrival = legs[0], -legs[-1]
     bounces = tuple(
         _bounce(faces, int(path.faces[0, i]), corners[i + 1], legs[i], link, terms[f"reflection {i + 1}"])
@@ -228,7 +229,7 @@ def power_sum_dbm(paths: tuple[ExplainedPath, ...]) -> float:
 def why_not(
     faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray, surfaces: Surfaces | None = None
 ) -> str:
-    """Return the reason why a sequence of faces (depth,) makes no path between two points, or "" if it makes a path.
+    """Return the reason why there is no path over faces (depth,) between two points, or "" if there is a path.
 
     Parameters
     ----------
@@ -249,14 +250,14 @@ def why_not(
         return _why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
-    # retrace on unbounded planes, so that the message can state by how many metres a point misses its face
+    # reflect at unbounded planes, so that the message can state by how many metres a point misses its face
     planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)
     points, ahead = retraced(planes, sequence[None], source_m[None], target_m[None], tolerance)
     if not ahead[0]:
         return "an end or an image lies behind a face: it has no reflection point"
     for step, face in enumerate(sequence):
         far = _outside_m(faces, int(face), points[0, step])
-        # stop at the first missed face: later points follow from it and would mislead
+        # stop at the first missed face, because later points follow from this one and would mislead
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
@@ -279,7 +280,7 @@ def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArra
     points = np.zeros((0, 3))
     if len(sequence):
         ends = source_m[None], target_m[None]
-        # first check the sides with faces of any size, then check whether the points lie in their faces
+        # first check the sides, with faces of any size. Then check whether the points are in their faces.
         _, _, ahead = reflection_points(surfaces, sequence[None], *ends, edge_m=1e9)
         if not ahead[0]:
             return "the ends of a reflection are on different sides of its face"
@@ -309,7 +310,7 @@ def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:
     """Return the simplest paths by name: the line of sight and the reflection at each ground of the scene."""
-    # infinite planes only: planes of terrain are bounded and valid for one link
+    # use only infinite planes, because planes of terrain are bounded and valid only for one link
     grounds = np.flatnonzero((replay.faces.solid < 0) & np.isinf(replay.faces.lower).all(axis=1))
     return [
         ("line of sight", np.zeros(0, dtype=np.int64)),

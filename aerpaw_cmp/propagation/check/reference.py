@@ -1,10 +1,11 @@
 """A second, independent replay of single links: slow, one element pair at a time, for the audit.
 
-It is written from the recommendations and shares no code with the rest of this package. Rotations are products of
-three rotations, and arrays come from their published layout. The constants of ITU-R P.2040-4 and P.833 are typed in
-separately. Reflection uses components across and along the plane of incidence. Paths are found by trying every sequence
-of faces against the footprints, and chords in crowns by bisection. Its inputs are the site, the settings and the poses.
-Antenna patterns are taken from the replay unchanged: Sionna's patterns check the formulas, and tests check the tables.
+It follows the recommendations directly, and shares no code with the rest of this package. Rotations are products of
+three rotations, and arrays come from their published layout. The constants of ITU-R P.2040-4 and P.833 are typed in a
+second time. Reflections use components across and along the plane of incidence. Paths are found by trying every
+sequence of faces against the footprints, and chords in crowns by bisection. The inputs are the site, the settings and
+the poses. Antenna patterns are those of the replay: their formulas are checked with Sionna's patterns, and their tables
+by tests.
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ C_MPS = 299_792_458.0
 # CODATA 2018. All constants of this file are typed a second time.
 _EPS0 = 8.8541878128e-12
 
-# Paths that appear or disappear if the geometry changes by this distance are not judged.
+# Paths that appear or disappear if the geometry changes by this distance are not judged [m].
 MARGIN_M = 1e-6
 
-# ITU-R P.2040-4 table 3: lowest and highest GHz, a, b, c, d; and the thickness of a wall [m], or None for a half-space
+# ITU-R P.2040-4, table 3: lowest and highest frequency [GHz], a, b, c, d. Then the thickness of a wall [m], or None for
+# a half-space.
 _P2040: dict[str, tuple[float, float, float, float, float, float, float | None]] = {
     "vacuum": (0.001, 100, 1.0, 0.0, 0.0, 0.0, None),
     "concrete": (1, 100, 5.24, 0.0, 0.0462, 0.7822, 0.3),
@@ -61,16 +63,16 @@ _P2040: dict[str, tuple[float, float, float, float, float, float, float | None]]
 
 @dataclass(frozen=True, slots=True)
 class ExpectedArray:
-    """Elements of one device as the settings describe them.
+    """The elements of one device according to the settings.
 
     Parameters
     ----------
     positions_m : tuple of (x, y, z)
     slants_deg : tuple of float
     patterns : tuple of Pattern
-        One per element.
+        Pattern of each element.
     mount : Matrix
-        Device to carrier.
+        Rotation from the device frame to that of its carrier (site or aircraft).
     """
 
     positions_m: tuple[Vector, ...]
@@ -81,7 +83,7 @@ class ExpectedArray:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedLink:
-    """Radio settings of a link, as configured."""
+    """The radio settings of a link, as configured."""
 
     carrier_hz: float
     transmit_power_dbm: float
@@ -93,16 +95,16 @@ class ExpectedLink:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedLoss:
-    """Foliage and reflection loss, as configured.
+    """The foliage and reflection loss, as configured.
 
     Parameters
     ----------
     model : {"none", "attenuating", "opaque"}
     gamma_db_per_m, maximum_db : float or None
-        Values used instead of those of P.833.
+        Values that replace those of P.833.
     in_leaf : bool
     reflection_db : float
-        Per reflection.
+        Loss per reflection [dB].
     """
 
     model: str = "none"
@@ -122,7 +124,7 @@ def layout_positions(
     layout : str
         ``single``, ``linear``, ``tower_comparison``, ``uav_comparison``, ``custom``.
     wavelength : float
-        [m].
+        Wavelength [m].
     elements : int
         Number of elements, for ``linear``.
     positions_m : sequence of (3,), optional
@@ -140,13 +142,13 @@ def layout_positions(
     q = wavelength / 4
     if layout == "uav_comparison":  # 2 x 2, column by column from the left, with the upper element first
         return ((0.0, q, q), (0.0, q, -q), (0.0, -q, q), (0.0, -q, -q))
-    # the first port leftmost, which is +y looking along x
+    # the first port is leftmost, which is +y when looking along x
     n = 1 if layout == "single" else elements
     return tuple((0.0, wavelength / 2 * ((n - 1) / 2 - k), 0.0) for k in range(n))
 
 
 def permittivity(name: str, carrier_hz: float) -> tuple[complex, float | None] | None:
-    """Return a material's complex relative permittivity and thickness. None if the table above does not have it."""
+    """Return a material's complex relative permittivity and thickness. None if it is not in the table."""
     key = name.lower().replace("-", "_").replace(" ", "_")
     key = key[4:] if key.startswith("itu_") else key
     ghz = carrier_hz / 1e9
@@ -197,7 +199,7 @@ def turned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
 
 
 def aircraft(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix:
-    """Return the rotation from forward-left-up to east-north-up, by the forward-right-down axes of textbooks."""
+    """Return the rotation from forward-left-up to east-north-up, via the forward-right-down axes of textbooks."""
     # heading, nose up and right wing down are right-handed rotations about down, right and forward
     to_ned = turned(yaw_deg, pitch_deg, roll_deg)
     enu_of_ned: Matrix = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -223,10 +225,10 @@ class Mirror:
     offset_m : float
     material : str
     start, along, length_m, low_m, high_m
-        For a wall: plan position of one end, its direction, its length, foot and top.
+        For a wall: plan position of one end, horizontal direction and length, foot and top.
     roof : Polygon, optional
     solid : int
-        Building, -1 for the ground.
+        Number of the building, -1 for the ground.
     """
 
     normal: Vector
@@ -261,10 +263,10 @@ class Mirror:
         return (west, south, self.low_m), (east, north, self.high_m)
 
     def margin(self, p: Vector) -> float:
-        """Return how far a point of the plane is from the face's edges [m], positive inside and negative outside."""
+        """Return the distance of a point of the plane from the face's edges [m], positive inside, negative outside."""
         if self.roof is not None:
             spot = Point(p[0], p[1])
-            # holes have boundaries too
+            # the boundary includes those of holes
             edge = float(self.roof.boundary.distance(spot))
             return edge if self.roof.covers(spot) else -edge
         if self.solid < 0:
@@ -274,7 +276,7 @@ class Mirror:
 
 
 def _edges(part: shapely.Polygon) -> Iterator[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Yield the edges of a footprint in the direction in which the building is on their left."""
+    """Yield the edges of a footprint, in the direction that has the building on the left."""
     for hole, ring in enumerate((part.exterior, *part.interiors)):
         points = list(ring.coords)
         for a, b in itertools.pairwise(points if ring.is_ccw is (hole == 0) else points[::-1]):
@@ -287,10 +289,10 @@ def _mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
     """Return the ground of the tower, then walls and roof of each building."""
     mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
     for number, building in enumerate(site.buildings):
-        # the same heights as in the replay, so that planes and edges can be compared
+        # use the same heights as the replay, so that planes and edges can be compared
         foot, top = min(building.base_m, 0.0) - 0.5, building.base_m + building.height_m
         footprint = building.footprint if building.footprint.is_valid else shapely.make_valid(building.footprint)
-        # repairing a ring that crosses itself may leave lines and points
+        # skip lines and points, which the repair of a ring that crosses itself may leave
         for part in shapely.get_parts(footprint):
             if part.geom_type != "Polygon" or part.area <= 0:
                 continue
@@ -310,14 +312,14 @@ def _mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
 
 
 class Blocks:
-    """The buildings as obstacles, grown or shrunk by a margin."""
+    """The buildings as obstacles, enlarged or shrunk by a margin."""
 
     def __init__(self, site: Site) -> None:
         self._site = site
         self._shapes: dict[float, list[Polygon]] = {}
 
     def cut(self, a: Vector, b: Vector, grow_m: float, spared: tuple[int, ...] = ()) -> bool:
-        """Check whether a segment crosses a building. Buildings in ``spared``, on which it ends, are shrunk a little.
+        """Check whether a segment crosses a building. Those in ``spared``, on which it ends, are shrunk a little.
 
         Parameters
         ----------
@@ -326,7 +328,7 @@ class Blocks:
         grow_m : float
             Enlarge every other building by this much on all sides [m].
         spared : tuple of int
-            Numbers of the buildings that the segment ends on.
+            Numbers of the buildings on which the segment ends.
 
         Returns
         -------
@@ -334,14 +336,14 @@ class Blocks:
         """
         shadow = LineString([a[:2], b[:2]])
         for number, building in enumerate(self._site.buildings):
-            # a segment ends on its own wall, and the enlarged building would always cut it
+            # a segment ends on a wall of this building, so the enlarged building would always cut it
             grown = -MARGIN_M / 10 if number in spared else grow_m
             top = building.base_m + building.height_m + grown
-            # a segment above the roof passes, regardless of what lies below
+            # a segment above the roof is free, regardless of the footprint below
             if min(a[2], b[2]) >= top or not self._near(number, a, b):
                 continue
             shape = self._shape(number, grown)
-            # a vertical segment is a point on the map, with which no line can intersect
+            # on the map, a vertical segment is a point, for which an intersection has no length
             if shadow.length < 1e-9:
                 if shape.contains(Point(a[:2])):
                     return True
@@ -375,8 +377,8 @@ class Blocks:
 # Mirrors (sequences, depth) by number, and images (sequences, depth + 1, 3) of the source.
 _Chains = tuple[IntArray, FloatArray]
 
-# Rounding moves a reflection point by less than this if image and target are at least MARGIN_M apart along the normal
-# of its plane.
+# Rounding shifts a reflection point by less than this [m] if image and target are at least MARGIN_M apart along the
+# normal of the plane.
 _SLACK_M = 0.1
 
 
@@ -428,7 +430,7 @@ class Reference:
         return (tower.east_m, tower.north_m, tower.ground_m + tower.antenna_height_m)
 
     def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
-        """Return all sequences of mirrors that may lead to a target. None if more than ``budget`` start at the tower.
+        """Return all sequences of mirrors that may lead to a target. None if there are more than ``budget``.
 
         The images of these sequences are on the correct sides, and the reflection points are in the boxes of the faces.
         """
@@ -446,9 +448,9 @@ class Reference:
         levels = [(rows, images)]
         for depth in range(max_depth):
             height = images[:, -1] @ self._planes.normal.T - self._planes.offset_m
-            # the source may lie on a face; an image may not
+            # the source may lie on a face, but an image may not
             facing = height > (0.0 if depth else -MARGIN_M)
-            # exclude the same face twice in a row, because it would send the ray back into itself
+            # exclude the same face twice in a row, because a ray cannot return to the face that it comes from
             if depth:
                 facing[np.arange(len(rows)), rows[:, -1]] = False
             past, mirror = np.nonzero(facing)
@@ -469,12 +471,13 @@ class Reference:
             with np.errstate(divide="ignore", invalid="ignore"):
                 at = image - (behind / through)[:, None] * (at - image)
             inside = (at >= planes.low_m[face] - _SLACK_M) & (at <= planes.high_m[face] + _SLACK_M)
-            # if the target is nearly in the plane, the point is undefined, so keep the sequence for the verdict
+            # if the target is nearly in the plane, the reflection point is undefined, so leave the decision to
+            # verdict()
             good &= (np.abs(through) < MARGIN_M) | (inside.all(axis=1) & (through > 0.0))
         return good
 
     def verdict(self, sequence: Sequence[Mirror], target: Vector, margin_m: float = MARGIN_M) -> bool | None:
-        """Check whether a path over the mirrors exists. None if a change of ``margin_m`` would decide."""
+        """Check whether a path over the mirrors exists. None if a shift by ``margin_m`` could change the result."""
         points = _bounces(sequence, self.source, target)
         if points is None:
             return False
@@ -482,7 +485,7 @@ class Reference:
         for step, mirror in enumerate(sequence):
             before, after = mirror.height(points[step]), mirror.height(points[step + 2])
             worst = min(worst, before + margin_m * (step == 0), after + margin_m * (step == last))
-        if worst >= -margin_m:  # the distance from edges takes longer, so compute it last
+        if worst >= -margin_m:  # compute the distance from edges last, because it takes longer
             worst = min([worst, *(m.margin(p) for m, p in zip(sequence, points[1:-1], strict=True))])
         if worst < -margin_m:
             return False
@@ -502,7 +505,7 @@ class Reference:
         Parameters
         ----------
         sequence : sequence of Mirror
-            Faces that the path meets, from the tower to the UAV.
+            Faces at which the path is reflected, from the tower to the UAV.
         tx, rx : int
             Elements of tower and UAV.
         target : (3,)
@@ -524,7 +527,7 @@ class Reference:
             image = mirror.mirrored(image)
         way = _plus(end, image, -1.0)
         length = math.sqrt(_dot(way, way))
-        # two elements at the same position have no direction between them
+        # no direction is defined between two elements at the same position
         if length == 0:
             return 0j
         rays = [_unit(way)]
@@ -539,7 +542,7 @@ class Reference:
         coupling = sum(a * b for a, b in zip(received, wave, strict=True))
         # limit to the transmitted power: the free-space formula is not valid in the near field
         spreading = min(1.0, wavelength / (4 * math.pi * length))
-        # whole cycles are subtracted before the exponential: 1 km are 11 000 cycles at 3.4 GHz
+        # subtract full cycles before the exponential: at 3.4 GHz, 1 km is 11 000 cycles
         return coupling * spreading * cmath.exp(-2j * math.pi * math.fmod(length / wavelength, 1.0))
 
     def _reflected(self, mirror: Mirror, wave: _Wave, ray: Vector, onward: Vector) -> _Wave:
@@ -559,7 +562,7 @@ class Reference:
         return e[0], e[1], e[2]
 
     def loss_db(self, sequence: Sequence[Mirror], target: Vector) -> float | None:
-        """Return the foliage and reflection loss of a path [dB]. None if it only just touches an opaque tree."""
+        """Return the foliage and reflection loss of a path [dB]. None if the path only just touches an opaque tree."""
         total = self.loss.reflection_db * len(sequence)
         if self.loss.model == "none" or not len(self.site.trees):
             return total
@@ -573,7 +576,7 @@ class Reference:
                 trunks += crown_depth_m(self.site.trees, a, b, trunks=True)
         if self.loss.model == "opaque":
             touched = depth + trunks
-            # rounding decides whether a chord of a micrometre exists
+            # rounding decides whether a chord of a micrometre exists, so do not judge it
             return None if 0 < touched < 1e-6 else (math.inf if touched else total)
         return total + foliage_db(self.loss, depth, self.link.carrier_hz)
 
@@ -585,7 +588,7 @@ class Reference:
         h = np.zeros((uav, tower), dtype=np.complex128)
         power = 0.0
         for sequence, loss in paths:
-            # the factor applies to the amplitude, so its exponent is half that of a power
+            # the factor applies to the amplitude, so the exponent is half of that for a power
             factor = 0.0 if math.isinf(loss) else 10 ** (-loss / 20)
             amplitudes = np.array(
                 [[factor * self.pair(sequence, t, u, target, turn) for t in range(tower)] for u in range(uav)]
@@ -629,7 +632,7 @@ def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -
     ----------
     array : ExpectedArray
     number : int
-        The element.
+        Number of the element.
     turn : (3, 3)
         Rotation from device to site axes.
     ray : (3,)
@@ -673,7 +676,7 @@ def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list
 
 
 def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
-    """Return the loss in foliage [dB] by ITU-R P.833 woodland. For leafless trees gamma is divided by 1.2."""
+    """Return the loss in foliage [dB] by ITU-R P.833 woodland. For leafless trees, gamma is divided by 1.2."""
     gamma, largest = _p833(carrier_hz / 1e6)
     gamma = gamma / (1.0 if loss.in_leaf else 1.2) if loss.gamma_db_per_m is None else loss.gamma_db_per_m
     largest = largest if loss.maximum_db is None else loss.maximum_db
@@ -698,8 +701,8 @@ def _p833(mhz: float) -> tuple[float, float]:
 def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -> float:
     """Return the length of a segment inside crowns (cones) or trunks (cylinders).
 
-    The largest of the distances outside base, top and side is a convex function along the segment. Golden section finds
-    its minimum, then bisection finds the two ends of the chord.
+    The largest of the signed distances from base, top and side is a convex function along the segment. Its minimum is
+    found by golden section, then the two ends of the chord by bisection.
 
     Parameters
     ----------
@@ -737,7 +740,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
         return np.asarray(np.maximum(np.maximum(low - up, up - high), side - reach))
 
     left, right, ratio = np.zeros(len(rows)), np.ones(len(rows)), (math.sqrt(5) - 1) / 2
-    # 0.618 to the power of 70 is 2e-15, about the rounding error
+    # 70 steps are enough: 0.618 to the power of 70 is 2e-15, about the rounding error
     for _ in range(70):
         near_left, near_right = right - ratio * (right - left), left + ratio * (right - left)
         lower = outside(near_left) < outside(near_right)

@@ -19,7 +19,7 @@ def free_space_dbm(
     Parameters
     ----------
     sources_m : (towers, 3) or (poses, towers, 3)
-        The second shape is for towers that move.
+        Array centres of the towers [m]. The second shape is for towers that move.
     targets_m : (poses, 3)
     carrier_hz, transmit_power_dbm : float
 
@@ -43,7 +43,7 @@ def two_ray_dbm(
     ground_m: FloatArray | float = 0.0,
     polarisation: str = "vertical",
 ) -> FloatArray:
-    """Return the power of line of sight plus one reflection on a flat ground, isotropic antennas [dBm].
+    """Return the power of line of sight plus one reflection off flat ground, for isotropic antennas [dBm].
 
     Source: ITU-R P.2040-3 eq. 37.
 
@@ -52,7 +52,7 @@ def two_ray_dbm(
     sources_m, targets_m, carrier_hz, transmit_power_dbm
         The same as in :func:`free_space_dbm`.
     ground_material : str
-        Half-space below ``ground_m``.
+        Material of the half-space below ``ground_m``.
     ground_m : float or (towers,)
         Height of the ground at each tower.
     polarisation : {"vertical", "horizontal"}

@@ -6,8 +6,8 @@ field vector ``w`` into::
 
     -r_tm w + (r_te + r_tm) s (s . w) / |s|^2,    s = k x n,    cos theta = |k . n|
 
-This is ``r_te e_s + r_tm e_p'`` of the textbook, mirrored. At normal incidence ``s`` is not defined, but there
-``r_te + r_tm`` is zero. Every formula accepts arrays or numbers.
+This is ``r_te e_s + r_tm e_p'`` of textbooks in mirrored coordinates. At normal incidence ``s`` is not defined, but
+there ``r_te + r_tm`` is zero. Every formula accepts arrays or numbers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     Parameters
     ----------
     image_m, place_m : Vector
-        Image of the tower's array, centre of the UAV's [m].
+        Image of the tower's array, and centre of the UAV's array [m].
     frame, axes : Rotation
         Device axes of the tower in the last space, and of the UAV.
     tower_m, uav_m : Vector
@@ -54,7 +54,7 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     ends = zip(place_m, turned_back(axes, uav_m), image_m, turned_back(frame, tower_m), strict=True)
     x, y, z = (place + uav - (image + tower) for place, uav, image, tower in ends)
     length = np.sqrt(x * x + y * y + z * z)
-    # np.where evaluates both branches, so the divisor must not be zero
+    # limit the divisor, because np.where evaluates both branches
     scale = np.where(length > 0.0, 1.0 / np.maximum(length, 1e-300), 0.0)
     return x * scale, y * scale, z * scale, length
 
@@ -81,7 +81,7 @@ def slant_rotation(e_theta: Number, e_phi: Number, cosine: Number, sine: Number)
 def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) -> Vector:
     """Return the field ``e_theta theta + e_phi phi`` of a device with axes ``m`` as a vector in site axes.
 
-    Sines and cosines of theta and phi are ratios of the direction's components; at a pole phi is 0.
+    Sines and cosines of theta and phi are ratios of the direction's components; at a pole, phi is 0.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def reflected(wave: Vector, toward: Vector, normal: Vector, te: Number, tm: Numb
 
 def spreading(cycles: Number) -> Number:
     """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1, because spreading is not a gain."""
-    # where two elements coincide the length is zero: infinity becomes 1
+    # two elements may coincide: the length is then zero, and infinity becomes 1
     return np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
 
 
@@ -149,7 +149,7 @@ def received(wave: Vector, uav: Vector, cycles: Number) -> Number:
     Parameters
     ----------
     wave : Vector
-        The wave that arrives.
+        Field vector of the incoming wave.
     uav : Vector
         Field vector that the UAV's element would radiate back.
     cycles : Number

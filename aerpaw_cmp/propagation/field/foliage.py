@@ -1,20 +1,20 @@
 """Loss in trees along traced paths, in closed form.
 
 Crowns are not in the traced scene. The polyline of each path (source, reflection points, target) is intersected with
-every crown near the path. The chords add up to the path's depth in foliage, and a model converts depth into loss. A
-changed parameter does not require new ray tracing, and foliage does not change the phase.
+every crown near the path. The chords add up to the path's depth in foliage, and a model converts depth into loss. If a
+parameter changes, rays need not be traced again. Foliage does not change the phase.
 
-Where crowns overlap, both chords count. Trunks count only for :class:`Opaque`: the shadow of a trunk is centimetres
-wide, and that of a crown is metres wide.
+Where crowns overlap, both chords are added. Trunks are used only for :class:`Opaque`, because the shadow of a trunk is
+centimetres wide, and that of a crown is metres wide.
 
 A forest can also be modelled as a medium. Its loss combines the components through, over and around the canopy.
 
 A forest stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below.
 The field behind a stand has three components whose powers add up (ITU-R P.833-10 section 3.2): through the canopy, over
-the top, and around either side. The loss through the canopy depends on the length inside it. The way over the top has
-two knife edges, where the ray enters and leaves. Near the top, part of the Fresnel zone is in the canopy. There, the
-component through the canopy is that of a ray lowered until the zone is below the top, and the detours only add the
-missing power. The level therefore has no step where a ray leaves the canopy.
+the top, and around either side. The loss through the canopy depends on the length inside the canopy. The path over the
+top has two knife edges, where the ray enters and leaves the stand. Near the top, part of the Fresnel zone is in the
+canopy. There, the component through the canopy is computed for a ray that is lowered until its Fresnel zone is below
+the top, and the detours only add the missing power. The level therefore has no step where a ray leaves the canopy.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Forest, Site, Trees
 from ..geometry import legs
 
-# Form of a crown between its base and the tree's top. The paper uses the cone.
+# Form of a crown between its base and the top of the tree. The paper uses the cone.
 Shape = Literal["cone", "cylinder"]
 
-# ITU-R P.833: near 1 GHz trees in leaf attenuate about 20 % more (dB/m) than leafless ones.
+# ITU-R P.833: near 1 GHz, trees in leaf attenuate about 20 % more (dB/m) than leafless trees.
 LEAFLESS_FACTOR = 1 / 1.2
 
 _PIECE_M = 8.0  # paths are looked up in pieces of this length
-# About the radius of a crown, so that a cell lists few crowns.
+# Side of a cell [m]: about the radius of a crown, so that a cell lists few crowns.
 _CELL_M = 4.0
 _MAX_CELLS = 4_000_000
-_PAIRS_AT_ONCE = 1_500_000  # pairs of a piece and a body; about 150 MB of temporary arrays
+_PAIRS_AT_ONCE = 1_500_000  # pairs of piece and crown; about 150 MB of temporary arrays
 
 
 # ---------------------------------------------------------------- models: depth in foliage to loss
@@ -67,7 +67,7 @@ P833_TABLE: tuple[tuple[float, float, float], ...] = (
     (1852.2, 0.30, 29.0),
     (2117.5, 0.34, 34.1),
 )
-_GAMMA_EXPONENT = 0.70  # slope of a log-log fit of the table
+_GAMMA_EXPONENT = 0.70  # slope of a log-log fit to the table
 _MAXIMUM_EXPONENT = 0.43  # A_m = A1 f^0.43, P.833's own fit for Mulhouse
 
 
@@ -101,8 +101,9 @@ class P833:
     def at(cls, frequency_hz: float, *, in_leaf: bool = True) -> P833:
         """Return parameters from P.833's table, interpolated log-log.
 
-        Beyond its ends (106 MHz, 2.1 GHz) the nearest entry is extrapolated with f^0.70 (gamma) and f^0.43 (A_m): 0.47
-        dB/m and 42 dB at 3.4 GHz, in leaf. Leafless gamma is ``LEAFLESS_FACTOR`` times that.
+        Beyond the ends of the table (106 MHz, 2.1 GHz), the nearest entry is extrapolated with f^0.70 (gamma) and
+        f^0.43 (A_m). At 3.4 GHz in leaf, this results in 0.47 dB/m and 42 dB. For leafless trees, gamma is multiplied
+        by ``LEAFLESS_FACTOR``.
 
         Raises
         ------
@@ -176,14 +177,14 @@ def foliage_loss_db(
     vertices_m : (paths, depth, 3)
         Reflection points in order; NaN where unused. ``depth`` may be 0.
     trees : Trees or CrownIndex
-        Pass an index if many batches of paths meet the same trees.
+        Trees, or their index if there are many batches of paths.
     model : FoliageModel
         Model that converts depth into loss.
 
     Returns
     -------
     ndarray, (paths,)
-        The model's loss of the path's total depth; NaN where an end is not finite.
+        Loss at the total depth of each path; NaN if an end is not finite.
     """
     index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = foliage_depth_m(source_m, vertices_m, target_m, index)
@@ -202,19 +203,19 @@ def foliage_depth_m(
     source_m, target_m : (paths, 3)
         Ends [m].
     vertices_m : (paths, depth, 3)
-        Points of reflection [m]; NaN where a path has fewer.
+        Points of reflection [m]; NaN where a path has fewer points.
     trees : Trees or CrownIndex
 
     Returns
     -------
     (paths,)
-        [m]; NaN where an end is not finite.
+        Length [m]; NaN if an end is not finite.
     """
     source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
     vertices = np.asarray(vertices_m, dtype=np.float64)
     index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = np.zeros(len(source))
-    # add the legs from target to source: a different order would change the last digit
+    # always add the legs from target to source, because another order would change the last digit
     for start, end in reversed([*legs(source, vertices, target)]):
         moved = (start != end).any(axis=1)
         depth[moved] += index.chords_m(start[moved], end[moved])
@@ -241,7 +242,7 @@ class CrownIndex:
     Parameters
     ----------
     trees : Trees
-        Trees to index; there may be none.
+        Trees to index. May be empty.
     shape : {"cone", "cylinder"}
         Form of all bodies.
     """
@@ -271,11 +272,11 @@ class CrownIndex:
     def _build_grid(self) -> None:
         """List, per cell, the bodies within reach of any point of the cell (compressed rows)."""
         centre, widest = self._bodies[:, :2], float(self._bodies[:, 4].max())
-        # a piece is looked up by its middle, so half of it must be within reach
+        # pieces are looked up by their middle, so extend the reach by half a piece
         reach = widest + _PIECE_M / 2
         low = centre.min(axis=0) - reach
         span = centre.max(axis=0) + reach - low
-        # limit the number of cells for woods of square kilometres, because of the memory
+        # limit the number of cells, to limit the memory for woods of square kilometres
         self._cell_m = max(_CELL_M, math.sqrt(float(span.prod()) / _MAX_CELLS))
         self._low, self._shape2 = low, (span / self._cell_m).astype(np.int64) + 1
         home = ((centre - low) / self._cell_m).astype(np.int64)
@@ -307,14 +308,14 @@ class CrownIndex:
         total = np.zeros(len(start_m))
         if not len(self._bodies) or not len(start_m):
             return total
-        # most of a flight is above all trees, and these parts are not looked up
+        # do not look up parts above all trees, which are most of a flight
         low, high = self._bodies[:, 2].min(), self._bodies[:, 3].max()
         first, last = slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
         along = np.hypot(end_m[:, 0] - start_m[:, 0], end_m[:, 1] - start_m[:, 1])
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
         ends = np.cumsum(pieces)
-        # the fullest cell limits the size of a batch, to bound its memory
+        # choose the size of a batch by the fullest cell, to limit the memory
         at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
         begin = 0
         while begin < len(live):
@@ -328,7 +329,7 @@ class CrownIndex:
     def _sum(
         self, start: FloatArray, end: FloatArray, first: FloatArray, last: FloatArray, pieces: IntArray
     ) -> FloatArray:
-        """Return the chords of a batch, looked up piece by piece. Each body counts in the piece nearest to it."""
+        """Return the chords of a batch, looked up piece by piece. Each body is counted in the piece nearest to it."""
         move = end - start
         segment = np.repeat(np.arange(len(start)), pieces)
         number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -344,7 +345,7 @@ class CrownIndex:
         square = step_east * step_east + step_north * step_north
         nearest = np.divide(east * step_east + north * step_north, square, out=low.copy(), where=square > 0)
         np.clip(nearest, low, last[owner], out=nearest)
-        # find the piece that contains that point, because other pieces meet the crown, too, and would count it twice
+        # find the piece that contains this point: other pieces also meet the crown, and would count it twice
         turn = np.divide(nearest - low, wide, out=np.zeros_like(low), where=wide > 0).astype(np.int64)
         east -= nearest * step_east
         north -= nearest * step_north
@@ -407,7 +408,7 @@ def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape:
     c = east**2 + north**2
     if shape == "cone":  # r = slope (top - up)
         slope, below = radius / (top - base), start[:, 2] - top
-        # this is negative if the segment is steeper than the cone's side
+        # the coefficient is negative if the segment is steeper than the side of the cone
         a = a - (slope * move[:, 2]) ** 2
         b = b - slope**2 * below * move[:, 2]
         c = c - (slope * below) ** 2
@@ -422,14 +423,14 @@ def _quadric_share(
     """Return the length of {t in [first, last]: a t^2 + 2 b t + c <= 0}, for a double cone only below its apex."""
     # a quarter of the usual discriminant, since the middle term is 2 b
     root2 = b * b - a * c
-    # q avoids the cancellation of -b + sqrt(...); a = 0 (parallel to the cone's side) gives one root at infinity
+    # q avoids the cancellation of -b + sqrt(...); for a = 0 (parallel to the cone's side), one root is at infinity
     q = -(b + np.copysign(np.sqrt(np.maximum(root2, 0.0)), b))
     with np.errstate(divide="ignore", invalid="ignore"):
         root, other_root = q / np.where(a == 0, 0.0, a), c / q
     nothing = q == 0  # b = 0 and a c = 0
     root, other_root = np.where(nothing, 0.0, root), np.where(nothing, 0.0, other_root)
     lower, upper = np.minimum(root, other_root), np.maximum(root, other_root)
-    steep = a < 0  # steeper than the cone's side: inside before the first root (rising) or after the second (falling)
+    steep = a < 0  # steeper than the side: inside before the first root (rising) or after the second root (falling)
     lower, upper = (
         np.where(steep, np.where(rise > 0, -np.inf, upper), lower),
         np.where(steep, np.where(rise > 0, lower, np.inf), upper),
@@ -441,16 +442,17 @@ def _quadric_share(
     return np.where(missed, 0.0, np.maximum(inside, 0.0))
 
 
-# Assumed ratio of the loss per metre between trunks to that in crowns.
+# Assumed ratio of the loss per metre between trunks to the loss per metre in crowns.
 TRUNKS = 0.3
-# Clearance at which a knife edge causes no loss, as a multiple of the first Fresnel radius.
-# At 0.55 of the first Fresnel radius nu is -0.78, where the knife edge's loss begins.
+# Clearance at which a knife edge does not cause a loss, as a multiple of the first Fresnel radius. At 0.55, nu is
+# -0.78, where the loss of the knife edge begins.
 _CLEAR = 0.55
 
-# Seen from above, a vertical segment is a point and does not cross an area. One end is therefore shifted by this
-# distance.
+# Seen from above, a vertical segment is a point and does not cross an area. One of its ends is therefore shifted by
+# this distance [m].
 _UPRIGHT_M = 1e-6
-# Pairs of a segment and a side of a forest stand; about 100 MB of temporary arrays.
+# Number of pairs of a segment and a side of a forest stand that are computed together: about 100 MB of temporary
+# arrays.
 _SIDES_AT_ONCE = 1_000_000
 
 
@@ -475,7 +477,7 @@ def stand_loss_db(
     vertices_m : (paths, depth, 3)
         Points of reflection [m]; NaN where unused.
     model : FoliageModel
-        Model of loss by depth in crowns. An opaque model also blocks waves over and around the trees.
+        Model of the loss by depth in crowns. An opaque model also blocks waves over and around the trees.
     wavelength_m : float
     in_leaf : FoliageModel, optional
         Model for the evergreen share of a forest stand. Default: ``model``.
@@ -483,7 +485,7 @@ def stand_loss_db(
     Returns
     -------
     (paths,)
-        [dB]
+        Loss [dB].
     """
     loss = np.zeros(len(source_m))
     for start, end in legs(source_m, vertices_m, target_m):
@@ -493,7 +495,7 @@ def stand_loss_db(
 
 
 def over_stands(site: Site, source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> BoolArray:
-    """Find the paths that run over the area of a stand, at any height.
+    """Find the paths that cross the area of a stand in plan, at any height.
 
     Parameters
     ----------
@@ -512,7 +514,7 @@ def over_stands(site: Site, source_m: FloatArray, vertices_m: FloatArray, target
 
 
 def stand_depth_m(site: Site, source_m: FloatArray, target_m: FloatArray) -> FloatArray:
-    """Return the length (lines,) [m] that straight lines between points (lines, 3) run in the stands of a site."""
+    """Return the length (lines,) [m] of straight lines between points (lines, 3) inside the stands of a site."""
     depth = np.zeros(len(source_m))
     for crossing in _crossings(site, source_m, target_m):
         depth[crossing.segment] += crossing.depth_m(np.zeros(len(crossing.segment)))
@@ -521,7 +523,7 @@ def stand_depth_m(site: Site, source_m: FloatArray, target_m: FloatArray) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class _Crossing:
-    """Segments over the area of one stand.
+    """Segments that cross the area of one stand in plan.
 
     Parameters
     ----------
@@ -529,7 +531,7 @@ class _Crossing:
     segment : (k,) int
         Numbers of the segments in the caller's arrays.
     start, end : (k, 3)
-        Their ends [m].
+        Ends of the segments [m].
     piece : (n,) int
         Index into the ``k`` segments for each piece within the area.
     share : (n, 2)
@@ -555,7 +557,7 @@ class _Crossing:
     def depth_m(self, lowered_m: FloatArray) -> FloatArray:
         """Return the length (k,) [m] in the canopy of segments that are lowered by ``lowered_m`` (k,).
 
-        The length between trunks is included, multiplied by ``TRUNKS``.
+        The length between the trunks is included, multiplied by ``TRUNKS``.
         """
         way = self.end - self.start
         up, rise = (self.start[:, 2] - lowered_m)[self.piece] - self.ground_m, way[self.piece, 2]
@@ -570,7 +572,7 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
     stands = [forest for forest in site.forests if forest.height_m is not None]
     if not stands:
         return
-    # the tree compares only bounding boxes, and the exact test follows
+    # the tree compares only bounding boxes. The exact test follows.
     tree = shapely.STRtree([stand.area for stand in stands])
     moved = np.flatnonzero(
         np.isfinite(start_m).all(axis=1) & np.isfinite(end_m).all(axis=1) & (start_m != end_m).any(axis=1)
@@ -599,24 +601,24 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
 
 
 def _corners(stand: Forest) -> tuple[FloatArray, IntArray]:
-    """Return corners (n, 2) of the rings of a stand, each closed, and the last corners of all rings but the last."""
+    """Return corners (n, 2) of the closed rings of a stand, and the last corner of each ring except the last ring."""
     rings = [shapely.get_coordinates(ring) for ring in (stand.area.exterior, *stand.area.interiors)]
     return np.concatenate(rings), np.cumsum([len(ring) for ring in rings[:-1]], dtype=np.int64) - 1
 
 
 def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return pieces of lines (k, 2) inside rings of corners: their lines (n,), and where they begin and end (n, 2)."""
+    """Return pieces of lines (k, 2) inside rings of corners: the line of each piece (n,), and its ends (n, 2)."""
     way = end - start
     # test on which side of each line a corner lies
     left = way[:, :1] * (corner[:, 1] - start[:, 1:]) - way[:, 1:] * (corner[:, 0] - start[:, :1]) > 0
-    crosses = left[:, 1:] != left[:, :-1]  # a corner belongs to only one of its sides
+    crosses = left[:, 1:] != left[:, :-1]  # count a corner on the line only once
     # there is no side from the last corner of one ring to the first corner of the next
     crosses[:, last] = False
     line, edge = np.divmod(np.flatnonzero(crosses), crosses.shape[1])  # nonzero of a table takes five times as long
     (east, north), (side_east, side_north) = (corner[edge] - start[line]).T, (corner[edge + 1] - corner[edge]).T
     way_east, way_north = way[line].T
     share = (east * side_north - north * side_east) / (way_east * side_north - way_north * side_east)
-    # if the number of sides behind the start is odd, the line begins inside
+    # if the line crosses an odd number of sides before its start, the start is inside
     inside = np.bincount(line[share <= 0.0], minlength=len(way)) % 2 == 1
     line, share = line[between := (share > 0.0) & (share < 1.0)], share[between]
     order, count = np.lexsort([share, line]), np.bincount(line, minlength=len(way))
@@ -637,7 +639,7 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     np.minimum.at(enter, crossing.piece, crossing.share[:, 0])
     np.maximum.at(leave, crossing.piece, crossing.share[:, 1])
     np.maximum.at(top, crossing.piece, crossing.height_m + crossing.ground_m)
-    # there are paths over and around it only if neither end is in the canopy
+    # there are paths over and around the stand only if neither end is in the canopy
     outside = ((enter > 1e-9) | (source[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (target[:, 2] > top))
     length, share = np.linalg.norm(target - source, axis=1), np.stack([enter, leave])
     intrusion = top - source[:, 2] - share * (target - source)[:, 2]
@@ -645,21 +647,22 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     depth_m = crossing.depth_m(np.where(outside, np.maximum((zone - intrusion).min(axis=0), 0.0), 0.0))
     through = model.loss_db(depth_m)
     if stand.evergreen_share:
-        # average decibels, not powers, because the share is a share of the trees along each path, not of the paths
+        # average decibels, not powers, because the evergreen share applies to the trees along each path, not to paths
         through = through + stand.evergreen_share * (in_leaf.loss_db(depth_m) - through)
     # a path without loss does not need a detour
     passed, some = np.zeros(count), np.flatnonzero(outside & (through > 0.0))
     over = Profile(length[some], share[:, some], intrusion[:, some])
     for way in (over, *_around(stand, source[some], target[some])):
-        # add powers: the edge of a canopy is not known to a wavelength
+        # add powers, because the edge of a canopy is not known to within a wavelength
         passed[some] += 10.0 ** (-deygout_db(way, wavelength_m) / 10.0)
-    # multiply the missing shares: a detour of full power then removes the loss, and without detours all loss remains
+    # multiply the missing shares of power: a detour with full power then removes the loss, and without detours the loss
+    # is unchanged
     blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.minimum(passed, 1.0))
     return np.asarray(-10.0 * np.log10(1.0 - blocked))
 
 
 def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, high: float) -> FloatArray:
-    """Return the share (pieces,) of each segment that runs between two heights."""
+    """Return the share (pieces,) of each segment that is between two heights."""
     first, last = slab(up, rise, low, high)
     return np.asarray(np.maximum(np.minimum(share[:, 1], last) - np.maximum(share[:, 0], first), 0.0))
 
@@ -684,7 +687,7 @@ class Profile(NamedTuple):
     """Edges under straight lines, one column of samples per line.
 
     ``length_m`` (links,) is the length of the lines, ``share`` (samples, links) the part of the line up to each sample,
-    and ``intrusion_m`` the height of the edge above the line there. It is NaN if the height is unknown.
+    and ``intrusion_m`` the height of the edge above the line at that sample, NaN if unknown.
     """
 
     length_m: FloatArray
@@ -693,7 +696,7 @@ class Profile(NamedTuple):
 
 
 def knife_edge_db(nu: FloatArray) -> FloatArray:
-    """Return the loss of one knife edge [dB] from its parameter nu. It is 0 below -0.78.
+    """Return the loss of one knife edge [dB] from its parameter nu. The loss is 0 below -0.78.
 
     Source: ITU-R P.526-15 eq. 31.
     """
@@ -703,7 +706,7 @@ def knife_edge_db(nu: FloatArray) -> FloatArray:
 
 
 def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Return the parameter nu of edges. It is -inf at the ends of a line and where the height is unknown."""
+    """Return the parameter nu of edges. The parameter is -inf at the ends of a line and where the height is unknown."""
     # an edge at an end has distance zero, and nu would be infinite
     inner = (before_m > 0.0) & (after_m > 0.0) & np.isfinite(height_m)
     product = np.where(inner, before_m * after_m, 1.0)
@@ -719,8 +722,8 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
 
     Notes
     -----
-    The loss is ``A + (A_1 - C_1) + (A_2 - C_2)``: the main edge and the main edge on each side of it, minus
-    ``C = (6 - A + A_e) cos(alpha)``. A_e is the loss of the side's edge alone on the direct line, and
+    The loss is ``A + (A_1 - C_1) + (A_2 - C_2)``: the loss of the main edge, and of the main edge on each side of it,
+    minus ``C = (6 - A + A_e) cos(alpha)``. A_e is the loss of the edge of that side alone on the direct line, and
     ``cos(alpha)^2 = d_1 d_34 / (d_12 d_234)``. Neither term is negative.
     """
     length_m, share, intrusion_m = profile
@@ -728,7 +731,7 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
     main, link = nu.argmax(axis=0), np.arange(len(length_m))
     total = first = knife_edge_db(nu[main, link])
     known = np.isfinite(nu[main, link])
-    # without an edge, any position is correct, because its loss is zero
+    # if there is no edge, use any position, because its loss is zero
     at, top = np.where(known, share[main, link], 0.5), np.where(known, intrusion_m[main, link], 0.0)
     for way, place in ((share, at), (1.0 - share, 1.0 - at)):
         # heights above the line from the end to the top of the main edge

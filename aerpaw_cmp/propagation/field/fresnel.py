@@ -30,20 +30,20 @@ def half_space(cosine: FloatArray, eta: ComplexArray) -> tuple[ComplexArray, Com
     -------
     te, tm, root : (...) complex
     """
-    # the imaginary part of the root has the sign of eta's, so that the refracted wave decays
+    # the imaginary part of the root has the sign of that of eta, so that the refracted wave decays
     root: ComplexArray = np.sqrt(eta - (1.0 - cosine * cosine))
     return (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root), root
 
 
 def echo(thickness: FloatArray, root: ComplexArray) -> ComplexArray:
-    """Return the factor of the way through a slab and back, 0 for half-spaces. Thickness is in wavelengths."""
+    """Return the factor of a round trip through a slab, 0 for half-spaces. Thickness is in wavelengths."""
     finite = np.isfinite(thickness)
-    # infinity times the root would be NaN
+    # avoid infinity times the root, which would be NaN
     return np.where(finite, np.exp(-4j * np.pi * np.where(finite, thickness, 0.0) * root), 0.0)
 
 
 def slab(r: ComplexArray, e: ComplexArray) -> ComplexArray:
-    """Return the coefficient of a slab, ``r (1 - e) / (1 - r^2 e)``. Without an echo e it is r.
+    """Return the coefficient of a slab, ``r (1 - e) / (1 - r^2 e)``. Without an echo e, the coefficient is r.
 
     Source: ITU-R P.2040-3 eq. 43.
 
@@ -86,7 +86,7 @@ def reflection_coefficients(
     permittivity : (...) complex
         Relative permittivity. Its imaginary part is negative.
     thickness_m : (...)
-        Thickness of the slab, infinite for a half-space.
+        Thickness of the slab [m], infinite for a half-space.
     wavelength : float
         Wavelength in air [m].
 
@@ -108,7 +108,8 @@ def reflection_coefficients(
 def face_table(faces: Faces, carrier_hz: float) -> FloatArray:
     """Return the materials of all faces at a carrier, shape (faces + 1, 3).
 
-    The columns are those of :data:`FaceMaterial`. The last row, -1, is a placeholder for paths without a face.
+    The columns are those of :data:`FaceMaterial`. The last row, which index -1 selects, is a placeholder for paths
+    without a face.
     """
     rows: dict[str, tuple[float, float, float]] = {}
     for name in set(faces.material):

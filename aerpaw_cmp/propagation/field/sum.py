@@ -8,7 +8,7 @@ determines the length ``L`` and all directions. The entry of the channel matrix 
 Here ``g`` is the complex field of an element as a vector. ``M_k`` is the dyad of reflection ``k`` with the Fresnel
 coefficients of ITU-R P.2040 at this pair's angle (:mod:`dyads`, :mod:`fresnel`). The time factor is ``e^{+j omega t}``.
 The pattern of the receiving element is not conjugated (reciprocity), so swapping the ends of a link transposes H. Each
-path is evaluated alone and added in the order of the path set: results do not depend on chunks and threads.
+path is evaluated separately, and added in the order of the path set, so results do not depend on chunks and threads.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from ..geometry import Array, Faces, Link, PathSet, Pattern, Poses, Rows, source
 from . import dyads
 from .fresnel import coefficients, face_table
 
-# Element pairs that NumPy evaluates at once: their columns stay in the cache of a core.
+# Number of element pairs that NumPy evaluates at a time, so that their columns stay in the cache of a core.
 PAIRS_PER_CHUNK = 8_000
 
-# Paths that are evaluated together: this limits the memory and does not change a result.
+# Number of paths that are evaluated together. It limits the memory, and does not change the result.
 PATHS_PER_PART = 4096
 
 
@@ -58,10 +58,10 @@ class Geometry(NamedTuple):
 
 
 class Elements(NamedTuple):
-    """Elements of both ends, spread over the pairs of a link: pair p joins UAV element p // ports and port p % ports.
+    """The elements of both ends for each pair of a link: pair p joins UAV element p // ports and port p % ports.
 
     Positions (towers, 3, pairs) and (3, pairs) are in the device frames [m]. Slants (towers, 2, pairs) and (2, pairs)
-    are given by their cosine and sine.
+    are stored as their cosine and sine.
     """
 
     tower_m: FloatArray
@@ -115,12 +115,12 @@ def geometry(
     frame = mounts[paths.tower]
     normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
     for step in range(depth):
-        normal = normals[:, step]  # a zero normal means no face: the point is not mirrored
+        normal = normals[:, step]  # a zero normal means that there is no face, so that the point is not mirrored
         offset = np.where(sequence[:, step] >= 0, faces.offset_m[sequence[:, step]], 0.0)
         image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
-        # mirror earlier faces, too, because the last image sees their mirror images
+        # mirror earlier faces, too, because in the space of the last image they are mirrored
         for vectors in (frame, normals[:, :step]):
-            # change the arrays in place, because they are copies
+            # the arrays are copies, so they can be changed in place
             vectors -= 2.0 * np.einsum("nij,nj->ni", vectors, normal)[..., None] * normal[:, None, :]
     # rotate only arrays of poses between the first and last of these paths
     first, last = paths.pose.min(initial=len(poses)), paths.pose.max(initial=0)
@@ -138,12 +138,12 @@ def geometry(
 
 
 def rows_of(matrix: FloatArray) -> dyads.Rotation:
-    """Return rotations (n, 3, 3) in the form that the formulas require, for broadcasting with (n, pairs)."""
+    """Return rotations (n, 3, 3) in the form that the formulas need, for broadcasting with (n, pairs)."""
     return tuple(tuple(matrix[:, i, j, None] for j in range(3)) for i in range(3))  # type: ignore[return-value]
 
 
 def parts_of(vector: AnyArray) -> dyads.Vector:
-    """Return vectors (n, 3) in the form that the formulas require, for broadcasting with (n, pairs)."""
+    """Return vectors (n, 3) in the form that the formulas need, for broadcasting with (n, pairs)."""
     return vector[:, 0, None], vector[:, 1, None], vector[:, 2, None]
 
 
@@ -177,7 +177,7 @@ def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: d
     theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)  # arccos would lose half of the digits at the poles
     fields = np.empty((len(theta), 2, theta.shape[1]), dtype=np.complex128)
     patterns = array.patterns if len(array.patterns) > 1 else array.patterns * len(array)
-    # elements often share one pattern object: evaluate it once for all of them
+    # evaluate each pattern once, because elements often share a pattern object
     for pattern in {id(p): p for p in patterns}.values():
         pairs = np.flatnonzero([patterns[e] is pattern for e in element])
         fields[:, 0, pairs], fields[:, 1, pairs] = pattern.field(theta[:, pairs], phi[:, pairs])
@@ -191,7 +191,7 @@ def plain(patterns: tuple[Pattern, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Fields:
-    """Sums over the paths of a replay.
+    """The sums over the paths of a replay.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ class Fields:
     path_power : (paths,)
         Mean over element pairs of ``|h|^2`` of each path alone.
     power : (poses, towers)
-        Sum of ``path_power``: what a receiver sees on average when the phases of the paths are random.
+        Sum of ``path_power``: the mean power at a receiver if the phases of the paths are random.
     """
 
     h: ComplexArray
@@ -209,10 +209,10 @@ class Fields:
 
 
 class Further(Rows):
-    """Paths of a kind other than reflections, one per row, with all that replays, drawings and descriptions need.
+    """Paths of a kind other than reflections, one path per row, with the data for replays, drawings and descriptions.
 
-    ``kind`` follows "path" in descriptions, and ``name`` is for tables. ``missing`` is the part of the kind that is not
-    modelled.
+    ``kind`` is written after the word "path" in descriptions, and ``name`` is used in tables. ``missing`` is the part
+    of the kind that is not modelled.
     """
 
     __slots__ = ()
@@ -221,13 +221,13 @@ class Further(Rows):
     missing: ClassVar[str]
 
     def lines(self) -> PathSet:
-        """Return the same polylines without faces, for terrain, foliage and drawings."""
+        """Return the paths as polylines without faces, for terrain, foliage and drawings."""
         raise NotImplementedError
 
     def fields(
         self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        """Return what the paths add to H and to the powers, like :func:`channel_matrices`.
+        """Return the contributions of the paths to H and to the powers, like :func:`channel_matrices`.
 
         Parameters
         ----------
@@ -258,7 +258,7 @@ class Further(Rows):
 def fields_of(
     paths: Any, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
 ) -> Fields:
-    """Return what any contribution to a replay adds to H and to the powers.
+    """Return the part of H and of the powers that comes from paths of any kind.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def fields_of(
     -------
     Fields
     """
-    # reflections are not a Further kind, because every engine finds them
+    # reflections are a separate class, because every engine finds them
     evaluate = channel_matrices if isinstance(paths, PathSet) else type(paths).fields
     return evaluate(paths, faces, sources_m, poses, link, loss_db)
 
@@ -286,9 +286,9 @@ def channel_matrices(
     ----------
     paths : PathSet
     faces : Faces
-        Faces that the paths refer to.
+        Faces to which the paths refer.
     sources_m : (towers, 3) or (poses, towers, 3)
-        Array centres, in the order of ``link.tower_arrays``. The second shape is for towers that move.
+        Array centres, in the order of ``link.tower_arrays`` [m]. The second shape is for towers that move.
     poses : Poses
     link : Link
     loss_db : (paths,), optional
@@ -336,7 +336,7 @@ def summed(
     evaluated : callable
         Returns the amplitudes (paths, pairs) of a part of the paths.
     paths : Rows
-        Sorted by pose and tower.
+        Paths, sorted by pose and tower.
     poses : int
         Number of poses.
     link : Link
@@ -357,10 +357,10 @@ def summed(
             amplitude *= amplitude_from_db(-loss_db[part])[:, None]
         power[part] = (np.abs(amplitude) ** 2).mean(axis=1)
         first = np.flatnonzero(np.diff(key[part], prepend=-1))
-        # a part ends between poses, so no link is written twice
+        # parts end between poses, so no link is written twice
         h[key[part][first]] = np.add.reduceat(amplitude, first, axis=0)
     matrices = h.reshape(poses, len(arrays), *ends)
-    # H is (receiver, transmitter): reciprocity makes the other direction its transpose
+    # H is (receiver, transmitter). By reciprocity, the other direction is the transpose.
     matrices = np.ascontiguousarray(matrices.swapaxes(2, 3)) if link.uav_transmits else matrices
     total = np.bincount(key, weights=power, minlength=len(h)).astype(np.float64)
     return Fields(matrices, power, total.reshape(poses, len(arrays)))
@@ -373,7 +373,7 @@ def amplitudes(
     wavelength: float,
     record: Callable[[str, AnyArray], None] | None = None,
 ) -> ComplexArray:
-    """Return the complex amplitudes of some paths: what each adds to H, before further losses.
+    """Return the complex amplitudes of some paths: the contribution of each path to H, before further losses.
 
     Parameters
     ----------
@@ -382,7 +382,7 @@ def amplitudes(
     ends : (paths, 2, pairs) complex or None, twice
         Pattern fields of tower and UAV: :func:`pattern_ends`.
     wavelength : float
-        [m]
+        Wavelength [m].
     record : callable, optional
         Called with the power (paths, pairs) of the "wave" after the tower and after each reflection, the "spreading" of
         the amplitude, and the power of the "uav". It requires paths of one depth.
@@ -394,7 +394,7 @@ def amplitudes(
     pairs = elements.tower_m.shape[2]
     out = np.empty((len(g.depth), pairs), dtype=np.complex128)
     step = max(1, PAIRS_PER_CHUNK // pairs)
-    # evaluate all paths of one depth together, so that no step is evaluated for shorter paths
+    # evaluate paths of one depth together, so that no step is computed in vain for shorter paths
     for depth in np.unique(g.depth):
         rows = np.flatnonzero(g.depth == depth)
         for start in range(0, len(rows), step):
@@ -459,10 +459,10 @@ def _power(wave: dyads.Vector) -> FloatArray:
 
 
 def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
-    """Return pattern fields (paths, 4, pairs) of both ends along the paths. None if all are 1 along theta."""
+    """Return pattern fields (paths, 4, pairs) of both ends along the paths. None if all of an end are 1 along theta."""
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
     plain_towers, plain_uav = all(plain(array.patterns) for array in arrays), plain(uav.patterns)
-    # 1 along theta does not need a table of directions
+    # patterns that are 1 along theta do not depend on the direction
     if plain_towers and plain_uav:
         return None, None
     x, y, z, _ = directions(g, elements)
@@ -517,7 +517,7 @@ def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float
 
 def mean_pair_power(h: ComplexArray) -> FloatArray:
     """Return the mean over the last two axes of ``|h|^2``, without underflow or overflow."""
-    # the squared magnitude of a complex number is the sum of two squares, so no root is needed
+    # sum the squares of real and imaginary parts, which does not need roots
     parts = np.ascontiguousarray(h).view(np.float64).reshape(*h.shape[:-2], 2 * h.shape[-2] * h.shape[-1])
     pairs = max(parts.shape[-1] // 2, 1)
     with np.errstate(over="ignore", under="ignore"):

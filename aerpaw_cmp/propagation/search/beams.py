@@ -1,12 +1,13 @@
-"""A compiled search for all specular paths among thousands of faces, which grows sequences along beams.
+"""A compiled search for all specular paths among thousands of faces. It extends sequences of faces along beams.
 
-The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces. The
-faces that it meets are second faces, and so on. At each step, the side planes of the beam (those of the last face and
-the mirrored planes of earlier faces) select receivers from a separate tree. For the remaining receivers the search
-computes the reflection points, whether each lies in its face, and whether a triangle cuts a segment. All cuts are
-conservative, so the paths do not depend on them. Pairs are streamed, so that memory does not grow with their number.
+The source is mirrored at a first face. The beam from that image through the outline of the face is intersected with the
+tree of faces. The faces that it hits are candidates for the second face, and so on. At each step, the side planes of
+the beam (those of the last face and the mirrored planes of earlier faces) select receivers from a separate tree. For
+the remaining receivers, the search computes the reflection points, and checks whether each point lies in its face, and
+whether a triangle cuts a segment. All cuts are conservative, so the paths do not depend on them. Pairs of faces are
+processed one after the other, so that the memory does not grow with their number.
 
-For thousands of prisms, compiled beams find candidates, and the exact rules of the image engine decide.
+For thousands of prisms, compiled beams find candidates, which are then checked by the exact rules of the image engine.
 
 The tolerances of the beams are a thousand times wider than those of the image engine. A candidate is rejected only if a
 segment runs through the middle of a wall or roof. Nearly all remaining candidates are paths. They are tested as in
@@ -35,16 +36,16 @@ from .mirror import Occlusion, merge, planes_of, retraced, scene_tolerance_m, se
 # A point closer to a plane than this [m] is on the plane.
 SIDE_M = 1e-6
 
-# A surface closer to an antenna than this [m] does not hide it: it is mounted there.
+# A surface closer to an antenna than this [m] does not hide the antenna, because the antenna is mounted on it.
 _END_M = 1e-3
 
-# Outlines are enlarged by this in the cuts [m], so that rounding does not remove a path.
+# Outlines of beams are enlarged by this [m], so that rounding does not remove a path.
 SLACK_M = 1e-5
 
 # Distance by which a reflection point may lie outside the triangles of its face [m], because of the seams between them.
 EDGE_M = 1e-6
 
-# A segment certainly cuts a triangle if it passes its edges by this share of the triangle's height.
+# A segment certainly cuts a triangle if it passes inside the edges by this share of the height of the triangle.
 _SOLID_MARGIN = 1e-6
 
 
@@ -71,7 +72,7 @@ class _Solids(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """The depth and the tolerances of a search. A ``margin`` above 0 means that the faces are those of solids."""
+    """The depth and the tolerances of a search. A ``margin`` above 0 means that the faces belong to solids."""
 
     depth: int
     clearance: float
@@ -93,17 +94,17 @@ def grow_paths(
     surfaces : Surfaces
     links : Links
     run : Run
-        Progress.
+        Run options, used for the progress.
     max_depth : int
-        0 to 3.
+        Largest number of reflections, 0 to 3.
     solids : bool
-        True if the faces are those of closed solids: only their fronts reflect, and a segment is cut only if that is
+        True if the faces belong to closed solids. Only their fronts reflect, and a segment is cut only if that is
         certain. The result contains candidates for :func:`find_paths`, including coincident paths.
 
     Returns
     -------
     PathSet
-        Sorted by pose, tower, depth, faces, with one of several coincident paths.
+        Paths, sorted by pose, tower, depth and faces. Of several coincident paths, only one is included.
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
@@ -121,7 +122,7 @@ def grow_paths(
         pose = np.flatnonzero(_direct(hiding, source, targets, rules))
         levels: list[_Level] = [(pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3)))]
         height = faces.normal @ source - faces.offset_m
-        # a sheet reflects on both sides unless the source is in its plane, and a solid only on its outside
+        # a sheet reflects on both sides, unless the source is in its plane. A solid reflects only on its outside.
         first = np.flatnonzero(mirrors.usable & (height >= -SIDE_M if solids else np.abs(height) > SIDE_M))
         # shuffle the faces, so that the reported progress grows evenly
         first = np.random.default_rng(0).permutation(first) if max_depth else first[:0]
@@ -129,7 +130,8 @@ def grow_paths(
         each = max(16, min(1024, len(first) // (8 * threads) + 1))
         chunks = [first[at : at + each] for at in range(0, len(first), each)]
         for at in range(0, len(chunks), 4 * threads):
-            # kernels release the interpreter's lock; no thread remains, so a process that is forked later has none
+            # kernels release the interpreter's lock. The threads end here, so that none exists when the process is
+            # forked later.
             with ThreadPoolExecutor(threads) as pool:
                 follow = partial(_follow, mirrors, hiding, receivers, source, rules)
                 levels += pool.map(follow, chunks[at : at + 4 * threads])
@@ -171,7 +173,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         return paths
     plane = np.append(surfaces.plane, -1)[paths.faces]
     key = np.column_stack([paths.pose, paths.tower, paths.depth, plane])
-    # keep the first of equal paths: paths are sorted, so it does not depend on threads
+    # keep the first of equal paths. Paths are sorted, so the choice does not depend on threads.
     _, first = np.unique(key, axis=0, return_index=True)
     paths = paths.select(np.sort(first))
     # compare the remaining paths of each link in pairs
@@ -181,7 +183,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
     repeated = np.zeros(len(paths), dtype=np.bool_)
     for rows in np.split(order, starts[1:]):
         depth = int(paths.depth[rows[0]])
-        # lines of sight have no points to compare
+        # lines of sight have no reflection points to compare
         if len(rows) < 2 or not depth:
             continue
         points = paths.vertices_m[rows, :depth]
@@ -207,14 +209,14 @@ def reflection_points(
         Faces of each path. If a reflection point misses its face, another face of the same plane is used.
     sources_m, targets_m : (paths, 3)
     edge_m : float
-        How far outside its face a point may lie.
+        Largest distance of a point outside its face [m].
 
     Returns
     -------
     sequence : (paths, depth) int
     vertices_m : (paths, depth, 3)
     good : (paths,) bool
-        True if each point is in its face and both ends of each reflection are on one side.
+        True if each point is in its face, and both ends of each reflection are on the same side.
     """
     order = np.argsort(surfaces.plane, kind="stable")
     start = np.searchsorted(surfaces.plane[order], np.arange(len(surfaces) + 1))
@@ -245,7 +247,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
         for step in range(depth - 1, -1, -1):
             f = sequence[row, step]
             low, top = _height(normal, offset, f, images[step]), _height(normal, offset, f, point)
-            # no reflection: the ends are on different sides of the mirror or in its plane
+            # there is no reflection if the ends are on different sides of the mirror or in its plane
             if low * top < 0.0 or abs(low) + abs(top) <= SIDE_M:
                 good[row] = False
                 break
@@ -283,7 +285,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     Parameters
     ----------
     corners : (triangles, 3, 3)
-        [m]
+        Corners of the triangles [m].
     tree : BoxTree
         Tree over the triangles.
     a, b : (3,)
@@ -291,7 +293,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     before, after : ((3,), float)
         Unit normals and offsets [m] of the mirrors at ``a`` and ``b``.
     rules : Rules
-        Clearance, reach of an antenna, and the margin by which a segment must meet a triangle.
+        Clearance, reach of an antenna, and margin by which a segment must hit a triangle.
 
     Returns
     -------
@@ -307,7 +309,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     lower, upper, child, start, many, items = tree
     todo = np.empty(DEEPEST, np.int64)
     todo[0], waiting = 0, np.int64(1)
-    while True:  # inlined code, so a second call would be compiled as well
+    while True:  # a second call of the inlined function would be compiled twice
         node, waiting = next_leaf(lower, upper, child, todo, waiting, (a, inverse))
         if node < 0:
             return -1
@@ -323,12 +325,12 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
 
 @part
 def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
-    """Return the share of the segment from ``a`` at which it meets a triangle, or -1.
+    """Return the share of the segment from ``a`` at which it hits a triangle, or -1.
 
     Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997), doi:10.1080/10867651.1997.10487468.
     """
     c, (d0, d1, d2) = corners, way
-    # seams between triangles of a sheet must not leak; a graze of a solid must not cut
+    # for sheets, close the seams between triangles; for solids, do not count grazing hits
     edge = margin if margin > 0.0 else -1e-9
     e0, e1, e2 = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
     g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
@@ -354,7 +356,7 @@ def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
 
 @part
 def _at_end(mirror, hit, distance, rules):  # type: ignore[no-untyped-def]
-    """Check whether a hit does not count because it is in the plane of the mirror or at the antenna of an end."""
+    """Check whether a hit must be ignored because it is in the plane of the mirror or at the antenna of an end."""
     normal, offset = mirror
     # a normal of zeros means an antenna
     if normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0:
@@ -367,7 +369,7 @@ def _direct(solids, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
     antenna = np.zeros(3), 0.0
     for r in range(len(targets)):
-        # do not use threads, because a line of sight takes too little time
+        # do not use threads, because lines of sight take too little time
         free[r] = segment_cut(solids.corners, solids.tree, source, targets[r], antenna, antenna, rules) < 0
     return free
 
@@ -402,7 +404,7 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
         offset = n0 * apex[0] + n1 * apex[1] + n2 * apex[2]
         reach = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
         planes[count, 0], planes[count, 1], planes[count, 2] = n0, n1, n2
-        # move the plane outwards: a cut may keep too much but must not remove a path
+        # move the plane outwards: too many candidates do no harm, but no path may be removed
         planes[count, 3] = -offset + SLACK_M * max(1.0, 1e3 / max(reach, 1e-3))
         count += 1
     return count
@@ -436,9 +438,9 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
     along, across : (faces, 3)
         Axes of the faces.
     f : int
-        The face.
+        Index of the face.
     p : (3,)
-        The point [m].
+        Position of the point [m].
     edge : float
         Distance by which the point may lie outside a triangle [m].
 
@@ -451,7 +453,7 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
     for t in range(first[f], first[f + 1]):
         c = flat[t]
         area = (c[1, 0] - c[0, 0]) * (c[2, 1] - c[0, 1]) - (c[1, 1] - c[0, 1]) * (c[2, 0] - c[0, 0])
-        # the corners of a triangle in a file may be in either direction
+        # in a file, the corners of a triangle may be listed in either direction
         sign = 1.0 if area > 0.0 else -1.0
         good = True
         for k in range(3):
@@ -467,7 +469,7 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
 
 @kernel
 def _ahead(normal, offset, f, sign, outline):  # type: ignore[no-untyped-def]
-    """Check whether a corner of an outline lies before a face, on the side ``sign`` of it."""
+    """Check whether a corner of an outline lies in front of a face, on its side ``sign``."""
     for k in range(WINDOW):  # noqa: SIM110 - compiled
         if sign * _height(normal, offset, f, outline[k]) > -SIDE_M:
             return True
@@ -476,7 +478,7 @@ def _ahead(normal, offset, f, sign, outline):  # type: ignore[no-untyped-def]
 
 @part
 def _reflects(shapes, level, chain, signs, images, points, target, rules):  # type: ignore[no-untyped-def]
-    """Check whether a path to a target meets each face of the sequence, and write the points into ``points``."""
+    """Check whether a path to a target is reflected at each face of the sequence. Write the points into ``points``."""
     normal, offset, along, across, first, flat = shapes
     strict, point = rules.margin == 0.0, target
     for step in range(level, -1, -1):
@@ -526,7 +528,7 @@ def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
 def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[no-untyped-def]
     """Return all paths whose first face is one of ``firsts``, by a depth-first search along beams.
 
-    It is one long function, because passing a record to another function makes numba count references to its arrays.
+    This is one long function, because passing a record to another function makes numba count references to its arrays.
     """
     normal, offset, along, across, window, plane, usable, first, flat = mirrors
     shapes = normal, offset, along, across, first, flat
@@ -542,7 +544,7 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
     spots, stack, reached = np.zeros((depth, 3)), np.empty(DEEPEST, np.int64), np.empty(len(targets), np.int64)
     next_faces[0, : len(firsts)] = firsts
     images[0], waiting[0] = source, len(firsts)
-    level = np.int64(0)  # a literal has a type of its own, for which functions would be compiled again
+    level = np.int64(0)  # functions would be compiled a second time for the type of a literal
     while level >= 0:
         if turn[level] >= waiting[level]:
             level -= 1
@@ -601,14 +603,14 @@ def _follow(mirrors, solids, receivers, source, rules, firsts):  # type: ignore[
 
 
 def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> int | None:
-    """Return the face that first cuts a path (depth + 2, 3) over the faces ``sequence``, from the source, or None."""
+    """Return the first face, from the source, that cuts a path (depth + 2, 3) over the faces ``sequence``, or None."""
     rules, antenna = Rules.of(surfaces, len(sequence)), (np.zeros(3), 0.0)
     normal, offset = np.ascontiguousarray(surfaces.faces.normal), surfaces.faces.offset_m.tolist()
     ends = [antenna, *((normal[face], offset[face]) for face in sequence), antenna]
     for (a, b), (before, after) in zip(pairwise(points_m), pairwise(ends), strict=True):
         first = -1
         while (hit := segment_cut(surfaces.corners_m, surfaces.tree, a, b, before, after, rules)) >= 0:
-            # a triangle may lie slightly in front of the plane of its face, at which the segment now ends
+            # the segment now ends at the plane of the face, and a triangle of the face may lie slightly in front of it
             if surfaces.face[hit] == first:
                 break
             first = int(surfaces.face[hit])
@@ -636,7 +638,7 @@ def try_out() -> None:
         raise RuntimeError(f"compiled code returned {free.tolist()} for a hidden and a visible point")
 
 
-# The ground extends to this multiple of the largest coordinate, which is beyond all reflection points.
+# The ground extends to this multiple of the largest coordinate, beyond all reflection points.
 REACH = 10.0
 
 # The bounding boxes of faces are enlarged by this distance [m].
@@ -646,7 +648,7 @@ OVERLAP_M = 1e-3
 def find_paths(
     faces: Faces, links: Links, run: Run = Run(), *, max_depth: int = 2, extent_m: FloatArray | None = None
 ) -> PathSet:
-    """Find the same paths as :func:`.mirror.find_paths`, in scenes that have too many sequences for it.
+    """Find the same paths as :func:`.mirror.find_paths`, in scenes with too many sequences for that function.
 
     Parameters
     ----------
@@ -657,7 +659,7 @@ def find_paths(
     Returns
     -------
     PathSet
-        Sorted by pose, tower, depth, faces.
+        Paths, sorted by pose, tower, depth and faces.
     """
     sources_m, targets_m = links.sources_m, links.targets_m
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
@@ -677,8 +679,8 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
     reach = REACH * float(max(1.0, *finite, *(np.abs(p).max(initial=0.0) for p in (known, sources_m))))
     vertices, triangle, owner = triangles(faces, reach)
     points = vertices[triangle]
-    # the bounding quadrilateral of a roof without right angles is larger than the roof, so the beam keeps more
-    # candidates
+    # for a roof without right angles, use its bounding quadrilateral. It is larger than the roof, so the beam keeps
+    # more candidates.
     outline = corners(faces, reach)
     axes = np.stack([faces.along[owner], faces.across[owner]], axis=1)
     flat = np.einsum("tki,tai->tka", points, axes)

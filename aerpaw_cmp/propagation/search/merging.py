@@ -1,10 +1,10 @@
 """Compiled code that merges triangles into planar faces.
 
-Triangles of one shape that share an edge and lie within a given tolerance of one plane are one face. Faces that touch
-or overlap in one plane share that plane, regardless of their shape. A reflection there is therefore one reflection.
+Triangles of one shape that share an edge and lie within a given tolerance of one plane form one face. Faces of
+different shapes that touch or overlap in one plane share that plane, so that a reflection there is counted once.
 
 The module also contains a compiled tree of boxes over triangles, faces or points, and its queries. Every query is
-conservative, because the final tests are computed on the items themselves, in float64.
+conservative: the final tests are computed for the items themselves, in float64.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ...site.mitsuba import TriangleScene
 from ..compiled import kernel, part
 from ..geometry import BoxTree, Faces, Surfaces
 
-# Size of the stack of a tree search: twice the depth of a tree with 4e9 items.
+# Size of the stack of a tree search. It is twice the depth of a tree with 4e9 items.
 DEEPEST = 64
 
 
@@ -62,7 +62,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
             for k in range(first, first + many):
                 low[node, axis] = min(low[node, axis], lower[items[k], axis])
                 high[node, axis] = max(high[node, axis], upper[items[k], axis])
-        # stop splitting: testing a few items takes no longer than testing their boxes
+        # stop splitting, because testing a few items does not take longer than testing their boxes
         if many <= leaf:
             continue
         longest, widest = 0, -1.0
@@ -74,7 +74,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
             if most_ - least > widest:
                 longest, widest = axis, most_ - least
         mine = items[first : first + many].copy()
-        # a full sort, because numba does not support a partition of indices
+        # sort completely, because numba does not support a partition of indices
         order = np.argsort(middle[mine, longest])
         items[first : first + many] = mine[order]
         half = many // 2
@@ -106,14 +106,14 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     node : int
         Index of the box.
     planes : (most, 4)
-        A plane is ``a x + b y + c z + d >= 0`` inside: normals pointing inwards, and offsets [m].
+        Inwards normals and offsets [m] of the planes: ``a x + b y + c z + d >= 0`` inside.
     many : int
         Number of rows that are used.
 
     Returns
     -------
     bool
-        False is also possible for a box that only the combination of planes excludes.
+        False is also returned for a box that only the combination of several planes excludes.
     """
     for p in range(many):
         a, b, c = planes[p, 0], planes[p, 1], planes[p, 2]
@@ -150,7 +150,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
         at_upper = (upper[node, axis] - a[axis]) * inverse[axis]
         if at_lower > at_upper:
             at_lower, at_upper = at_upper, at_lower
-        # widen the interval, so that rounding does not lose a box that is only just met
+        # widen the interval, so that rounding does not lose a box that is only just hit
         enter = max(enter, at_lower - 1e-12 * abs(at_lower))
         leave = min(leave, at_upper + 1e-12 * abs(at_upper))
     return enter > leave
@@ -158,13 +158,13 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
 
 @part
 def next_leaf(lower, upper, child, todo, waiting, segment):  # type: ignore[no-untyped-def]
-    """Find the next leaf whose box a segment meets.
+    """Find the next leaf whose box is hit by a segment.
 
     Parameters
     ----------
     lower, upper, child
-        Columns of a :class:`BoxTree`. They are separate, because compiled code would count references to a tuple at
-        every leaf.
+        Columns of a :class:`BoxTree`. They are passed separately, because compiled code would count references to a
+        tuple at every leaf.
     todo : (DEEPEST,) int
         Stack of nodes to visit. At the start it contains only the root, 0.
     waiting : int
@@ -175,7 +175,7 @@ def next_leaf(lower, upper, child, todo, waiting, segment):  # type: ignore[no-u
     Returns
     -------
     node, waiting : int
-        The leaf, or -1 after the last one, and the number of nodes in ``todo``.
+        The leaf, or -1 after the last leaf, and the number of nodes in ``todo``.
     """
     while waiting > 0:
         waiting -= 1
@@ -199,9 +199,9 @@ def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-de
     planes, many
         The same as in :func:`box_outside`.
     todo : (DEEPEST,) int
-        Space for nodes to visit.
+        Array for the nodes to visit.
     hits : (items,) int
-        Receives the items. Its length is the number of items in the tree.
+        Receives the items. The length of the array is the number of items in the tree.
 
     Returns
     -------
@@ -225,10 +225,10 @@ def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-de
 
 
 # Triangles form one face if their corners are within this distance of one plane [m]. Coordinates in files are float32,
-# which has steps of 0.1 mm at 1 km.
+# with steps of 0.1 mm at 1 km.
 _MERGE_M = 1e-3
 
-# Corners of one shape closer than this are one corner [m].
+# Corners of one shape that are closer than this are one corner [m].
 WELD_M = 1e-4
 
 # Largest number of corners of the convex outline of a face in the search. Larger outlines are replaced by a rectangle.
@@ -274,11 +274,11 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     high = np.maximum.reduceat(corners.max(axis=1), first[:-1], axis=0)
     # enlarge by the tolerance, so that neighbours in one plane touch
     face_tree = box_tree(low - merge_m, high + merge_m)
-    # largest first, so that each face is tested after all faces that it may join
+    # test the largest faces first, so that each face is tested after all faces that it may join
     order = np.argsort(-face_area, kind="stable")
     plane = _shared_planes(face_tree, corners, first, (normal, offset), face_area, order, (low, high), merge_m)
     of_face = shape[first[:-1]]
-    # faces are numbered within their shape
+    # number the faces within each shape
     numbers = defaultdict[int, Iterator[int]](lambda: itertools.count(1))
     labels = tuple(f"{scene.shapes[s]} face {next(numbers[s])}" for s in of_face.tolist())
     unbounded = Faces(normal[plane], offset[plane], tuple(scene.materials[s] for s in of_face), labels)
@@ -316,7 +316,7 @@ def _faces_of_triangles(
     corners: FloatArray, normal: FloatArray, offset: FloatArray, area: FloatArray, shape: IntArray, merge_m: float
 ) -> tuple[IntArray, IntArray]:
     """Return the face of each triangle, and the largest triangle of each face, which defines its plane."""
-    # files repeat corners for each triangle in float32: corners within 0.1 mm are equal
+    # treat corners within 0.1 mm as equal, because files repeat corners for each triangle in float32
     grid = np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64)
     # compare corners only within one shape, because touching walls of two houses are two faces
     key = np.column_stack([np.repeat(shape, 3), grid])
@@ -358,7 +358,7 @@ def _merge_neighbours(order, corners, normal, offset, neighbours, merge_m):  # t
 
 @kernel
 def _joining(triangle, number, face, todo, corners, plane, neighbours, merge_m):  # type: ignore[no-untyped-def]
-    """Add neighbours of a triangle in its face's plane to the face and to ``todo``. Return their number."""
+    """Add neighbours of a triangle that are in the plane of its face to the face and to ``todo``. Return the count."""
     edges, triangle_of, start = neighbours
     many = 0
     for edge in edges[triangle]:
@@ -383,7 +383,7 @@ def _lie_in(corners, first, after, plane, merge_m):  # type: ignore[no-untyped-d
 def _shared_planes(tree, corners, first, planes, area, order, bounds, merge_m):  # type: ignore[no-untyped-def]
     """Return, for each face, the face whose plane it uses.
 
-    This is a larger face that it touches and in whose plane it lies, or the face itself.
+    This is a larger face that the face touches and in whose plane it lies, or else the face itself.
     """
     (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))
@@ -394,13 +394,13 @@ def _shared_planes(tree, corners, first, planes, area, order, bounds, merge_m): 
         for axis in range(3):
             sides[axis, axis], sides[axis, 3] = 1.0, merge_m - low[f, axis]
             sides[3 + axis, axis], sides[3 + axis, 3] = -1.0, high[f, axis] + merge_m
-        many = within_planes(tree, sides, np.int64(6), todo, near)  # a literal 6 has a type of its own
+        many = within_planes(tree, sides, np.int64(6), todo, near)  # a literal 6 would have another type
         best = -1
         for neighbour in near[:many]:
             if area[neighbour] < area[f] or (area[neighbour] == area[f] and neighbour >= f):
                 continue
             lead = plane[neighbour]
-            # skip planes of another direction, because a tiny face is within a millimetre of many planes
+            # skip planes with another direction, because a tiny face is within a millimetre of many planes
             if abs(np.dot(normal[lead], normal[f])) < 0.7:
                 continue
             if not _lie_in(corners, first[f], first[f + 1], (normal[lead], offset[lead]), merge_m):
@@ -413,15 +413,16 @@ def _shared_planes(tree, corners, first, planes, area, order, bounds, merge_m): 
 
 
 def _windows(flat: FloatArray, first: IntArray, faces: Faces) -> FloatArray:
-    """Return convex outlines (faces, 8, 3), counter-clockwise round the normal."""
+    """Return convex outlines (faces, 8, 3), counter-clockwise around the normal."""
     owner = np.repeat(np.arange(len(faces)), 3 * np.diff(first))
-    # a corner that turns by a tenth of a micrometre is a rounding error, and would use one of the eight corners
+    # remove corners that deviate by a tenth of a micrometre: they are rounding errors, and would use up the eight
+    # corners
     hull = shapely.simplify(shapely.convex_hull(shapely.multipoints(flat.reshape(-1, 2), indices=owner)), 1e-7)
     corners = shapely.get_num_coordinates(hull) - 1
     hull[corners > WINDOW] = shapely.oriented_envelope(hull[corners > WINDOW])
     point, face = shapely.get_coordinates(shapely.orient_polygons(hull), return_index=True)
     start = np.searchsorted(face, np.arange(len(faces) + 1))
-    # a ring closes with its first corner, which the window does not need; a sliver may have become a line
+    # omit the repeated first corner of a ring, which the window does not need. A sliver may have become a line.
     last = start[1:] - np.where(shapely.get_type_id(hull) == shapely.GeometryType.POLYGON, 2, 1)
     outline = point[np.minimum(start[:-1, None] + np.arange(WINDOW), last[:, None])]
     base = faces.normal * faces.offset_m[:, None]

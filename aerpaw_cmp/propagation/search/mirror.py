@@ -2,11 +2,11 @@
 
 For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path exists if
 
-1. each image lies in front of the next face, and the target in front of the last (decided per sequence);
-2. going back from the target, each line to the current image meets its face inside the polygon;
+1. each image lies in front of the next face, and the target in front of the last face (decided per sequence);
+2. going back from the target, each line to the current image intersects its face inside the polygon;
 3. no segment is cut by a solid.
 
-A sequence is followed only while the beam from the image through its last face can still reach the next one. The
+A sequence is extended only to faces that the beam from the image through its last face can reach. The
 tolerance of side tests is relative to the size of the scene, far above the rounding error of a reflection point. A
 solid blocks only segments through its interior, so a path along a wall exists, and there is no gap between two walls.
 An end that lies on a face reflects there like an end just in front of it, so the level does not jump when a UAV lands.
@@ -14,12 +14,13 @@ An end that lies on a face reflects there like an end just in front of it, so th
 Segments are occluded by buildings if the open segment meets the open solid.
 
 A building is a prism: its footprint, cut into convex pieces, from its foot to its roof. A segment is cut if a part of
-it runs inside a piece, deeper than a tolerance for rounding. A segment that only touches a wall, an edge, a corner or a
+it is inside a piece, deeper than a tolerance for rounding. A segment that only touches a wall, an edge, a corner or a
 roof is not cut, regardless of where it ends. Two buildings that touch are one solid: a segment that runs in the seam
 between them, outside both, is cut too.
 
 Triangles have a separate rule (:func:`.beams.segment_cut`), because an open sheet has no inside. On a grid of 3 984
-segments around two touching boxes, the rule of sheets differs for 198 segments, which run along walls or in the seam.
+segments around two touching boxes, the rule for sheets has a different result for 198 segments, which run along walls
+or in the seam.
 """
 
 from __future__ import annotations
@@ -38,17 +39,17 @@ from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..geometry import Faces, Links, PathSet, corners, inside, legs
 from ..options import Progress
 
-# Pairs of a segment and a solid that are tested together.
+# Number of pairs of a segment and a solid that are tested together.
 PAIRS_PER_CHUNK = 1_000_000
 
 # Radius, in tolerances, within which a point of a seam must be surrounded by buildings. Shorter seams do not block. At
-# 1 km it is about ten micrometres, far above rounding errors and far below any gap on a map.
+# 1 km, the radius is about ten micrometres, far above rounding errors and far below any gap on a map.
 _NEIGHBOURHOOD = 1e4
 
 # Share of its area by which a convex footprint may be smaller than its hull.
 _ROUNDING = 1e-13
 
-_ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # offset so that no direction coincides with a map axis
+_ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # no direction coincides with a map axis
 _AROUND = np.column_stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros(16)])
 
 
@@ -61,7 +62,7 @@ class Occlusion:
         Faces with ``solid >= 0`` are roofs and walls of prisms. The ground does not block, because all paths are above
         it.
     tolerance_m : float
-        A segment is cut if it runs deeper than this inside a solid.
+        A segment is cut if a part of it is deeper than this inside a solid.
     """
 
     def __init__(self, faces: Faces, tolerance_m: float) -> None:
@@ -77,7 +78,7 @@ class Occlusion:
         solid, footprint, self.pieces = _prisms(faces, rows, starts)
         # pieces of each solid
         self.parts = [range(*ends) for ends in pairwise(np.searchsorted(solid, np.arange(len(starts) + 1)).tolist())]
-        # whether another piece, of any solid, touches a piece
+        # True for each piece that touches another piece, of any solid
         self.abutting = _abutting(footprint, tolerance_m)
 
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
@@ -106,10 +107,10 @@ class Occlusion:
         solids = np.flatnonzero(near_all.all(axis=1))
         near = self._boxes(start, end, solids)
         result = np.zeros(len(start), dtype=np.bool_)
-        # most segments touch nothing, so seams are examined after all pieces
+        # examine seams after all pieces, because most segments do not touch a solid
         seams: list[tuple[IntArray, FloatArray, FloatArray, IntArray]] = []
         for column, solid in enumerate(solids.tolist()):
-            # skip segments that another piece has cut already
+            # skip segments that another piece already cuts
             rows = np.flatnonzero(near[:, column] & ~result)
             for piece in self.parts[solid]:
                 if not len(rows):
@@ -120,7 +121,7 @@ class Occlusion:
                 hit = enter < leave
                 result[rows[hit]] = True
                 if self.abutting[piece]:
-                    # grow the piece by the tolerance, to find segments that run along it without entering it
+                    # enlarge the piece by the tolerance, to find segments that run along it without entering it
                     enter, leave = _within(before[~hit], after[~hit], self.tolerance_m)
                     along = enter < leave
                     touching = rows[~hit][along]
@@ -137,9 +138,9 @@ class Occlusion:
         return result
 
     def _boxes(self, start: FloatArray, end: FloatArray, solids: IntArray) -> BoolArray:
-        """Check whether segments meet bounding boxes: slab test, (segments, solids)."""
+        """Check whether segments hit bounding boxes (segments, solids), by the slab test."""
         direction = end - start
-        # for a level segment the quotients become huge with the correct sign, whereas 0 / 0 would be NaN
+        # replace 0 by a tiny number: the quotients become huge with the correct sign, whereas 0 / 0 would be NaN
         direction = np.where(direction == 0.0, 1e-300, direction)
         low, high = self.low[solids], self.high[solids]
         enter = np.zeros((len(start), len(solids)))
@@ -158,14 +159,14 @@ class Occlusion:
     ) -> bool:
         """Check whether a segment is blocked: the pieces along which it runs surround one of its points completely.
 
-        The segment runs along each of the ``pieces`` (n,) from the share ``enter`` to the share ``leave`` of its
-        length.
+        The segment runs along each of the ``pieces`` (n,) from the share ``enter`` to the share ``leave`` of the
+        segment.
         """
         radius_m = _NEIGHBOURHOOD * self.tolerance_m
         length_m = float(np.linalg.norm(end - start))
         breaks = np.unique([enter, leave])
         long = np.flatnonzero(np.diff(breaks) * length_m > 10.0 * radius_m)
-        # between two breaks the segment runs along the same pieces, so one point is sufficient
+        # between two breaks, the segment runs along the same pieces, so one point is sufficient
         for share in (breaks[long] + breaks[long + 1]) / 2:
             point = start + share * (end - start)
             ring = point + radius_m * _AROUND
@@ -195,7 +196,7 @@ def _within(before: FloatArray, after: FloatArray, level: float) -> tuple[FloatA
 
 
 def _by_solid(faces: Faces) -> tuple[IntArray, IntArray]:
-    """Return faces of solids, one solid after another, and where each solid starts among them."""
+    """Return the faces of solids, one solid after another, and the index of the first face of each solid."""
     order = np.argsort(faces.solid, kind="stable")
     rows = order[faces.solid[order] >= 0]
     solid = faces.solid[rows]
@@ -207,14 +208,14 @@ def _prisms(
 ) -> tuple[IntArray, list[Polygon], list[tuple[FloatArray, FloatArray]]]:
     """Return the convex pieces of all solids: number of the solid, footprint and planes of each.
 
-    ``rows`` are the faces of solids, one solid after another from ``starts`` on.
+    ``rows`` are the faces of the solids, one solid after another. ``starts`` are the indices of the first face of each.
     """
     if not len(rows):
         return np.zeros(0, np.int64), [], []
     number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(rows)))
     # compare exactly, because roofs are created with this normal
     level = faces.normal[rows, 2] == 1.0
-    # the foot of a building is the lower end of its lowest wall, so roofs are ignored
+    # ignore roofs, because the foot of a building is the lower end of its lowest wall
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
     roofs = rows[level]
     footprints = _footprints(faces, roofs)
@@ -242,14 +243,14 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
 def convex_pieces(footprint: Polygon) -> tuple[Polygon, ...]:
     """Split a footprint that is not convex into convex polygons without additional corners.
 
-    Triangles are joined while the result is convex (Hertel and Mehlhorn, 1983). The pieces are cached, because each
-    replay needs them.
+    Triangles are joined as long as the result is convex (Hertel and Mehlhorn, 1983). The pieces are cached, because
+    every replay needs them.
     """
     pieces = list(shapely.get_parts(shapely.constrained_delaunay_triangles(footprint)))
     first = 0
     while first < len(pieces):
         for second in range(first + 1, len(pieces)):
-            # try each join, because its convexity depends on both outer angles
+            # try each join, because the convexity of the result depends on the angles at both ends
             union = shapely.union(pieces[first], pieces[second])
             if union.geom_type == "Polygon" and _is_convex(union):
                 pieces[first] = union
@@ -269,7 +270,7 @@ def _is_convex(polygons: Polygon | AnyArray) -> BoolArray:
 
 def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     """Return the outward normals and offsets of each convex prism: top, bottom, sides."""
-    # the outside is to the right of each edge of a counter-clockwise ring
+    # the outside is on the right of each edge of a counter-clockwise ring
     ring = shapely.get_exterior_ring(shapely.orient_polygons(np.array(footprints, dtype=object)))
     point, owner = shapely.get_coordinates(ring, return_index=True)
     edge, start, side_of = np.diff(point, axis=0), point[:-1], owner[:-1]
@@ -288,7 +289,7 @@ def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> lis
 
 
 def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
-    """Check for each piece whether another piece comes within the tolerance."""
+    """Check for each piece whether another piece is within the tolerance."""
     touched = np.zeros(len(footprints), dtype=np.bool_)
     if len(footprints) > 1:
         first, second = shapely.STRtree(footprints).query(footprints, predicate="dwithin", distance=tolerance_m)
@@ -296,10 +297,10 @@ def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
     return touched
 
 
-# Relative to the largest coordinate: about a thousand times the rounding error of a plane equation.
+# Tolerance relative to the largest coordinate: about a thousand times the rounding error of a plane equation.
 RELATIVE_TOLERANCE = 1e-12
 
-# A link shorter than this has no path: its ends are not in the far field, and a zero length has no direction.
+# A link shorter than this has no path [m]: its ends are not in the far field, and a length of zero has no direction.
 MINIMUM_LENGTH_M = 0.01
 
 # Largest number of face sequences per tower of the ``image`` engine.
@@ -311,7 +312,7 @@ CELLS_PER_CHUNK = 1_000_000
 # Number of targets whose heights over all faces are cached.
 TARGETS_AT_ONCE = 1024
 
-# Margin of a choice of mirrors before the search [m]: it is far above the tolerance of any search.
+# Margin for selecting mirrors before the search [m], far above the tolerance of any search.
 REACH_SLACK_M = 1e-3
 
 
@@ -332,18 +333,18 @@ def find_paths(
         Closed solids and ground planes.
     links : Links
     max_depth : int
-        0 to 3.
+        Largest number of reflections, 0 to 3.
     budget : int
-        Largest number of sequences followed per tower.
+        Largest number of sequences per tower.
     extent_m : (points, 3), optional
         Points that determine the tolerance instead of the targets, if the targets are a part of a job.
     progress : callable, optional
-        Called with the share done.
+        Called with the completed share.
 
     Returns
     -------
     PathSet
-        Sorted by pose, tower, depth, faces.
+        Paths, sorted by pose, tower, depth and faces.
 
     Raises
     ------
@@ -353,7 +354,7 @@ def find_paths(
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
     sources_m, targets_m, usable = links.sources_m, links.targets_m, links.usable
-    # a part of a flight needs the tolerance of the complete flight to find the same paths
+    # use the extent of the complete flight, so that a part of it is searched with the same tolerance
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
@@ -396,10 +397,10 @@ class _Bounds:
     Parameters
     ----------
     corners_m : (faces, 4, 3)
-        Corners in order around the face. Infinite faces are cut far away.
+        Corners in order around the face. Infinite faces are cut off far away.
     centre_m : (faces, 3)
     reach_m : (faces, 2, 3)
-        Half of each side.
+        Half of each side [m].
     """
 
     corners_m: FloatArray
@@ -409,13 +410,13 @@ class _Bounds:
 
 @dataclass(frozen=True, slots=True)
 class Sequences:
-    """Face sequences of one length with their images.
+    """The face sequences of one length, with their images.
 
     Parameters
     ----------
     faces : (sequences, depth) int
     images_m : (sequences, depth, 3)
-        The source mirrored at the first 1, 2, ... faces.
+        Images of the source after the first, second, ... face [m].
     """
 
     faces: IntArray
@@ -424,7 +425,7 @@ class Sequences:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Growth:
-    """The growth of face sequences, face by face, for any position of the tower.
+    """The extension of face sequences, face by face, for any position of the tower.
 
     Parameters
     ----------
@@ -448,7 +449,7 @@ class Growth:
 
     @classmethod
     def of(cls, faces: Faces, points_m: FloatArray, tolerance_m: float, max_depth: int, budget: int) -> Growth:
-        """Return the growth between points.
+        """Return the object for a scene and for ends within the span of points.
 
         Parameters
         ----------
@@ -462,11 +463,12 @@ class Growth:
         -------
         Growth
         """
-        # cut infinite faces at ten times the farthest point: far beyond any reflection between two points of the scene
+        # cut infinite faces off at ten times the farthest point, far beyond any reflection between two points of the
+        # scene
         box = corners(faces, 10.0 * float(max(1.0, np.abs(points_m).max(initial=0.0))))
         first, second, third, fourth = box.transpose(1, 0, 2)
         bounds = _Bounds(box, (first + third) / 2, np.stack([second - first, fourth - first], axis=1) / 2)
-        # pairs of faces are needed from the second reflection on
+        # pairs of faces are needed only for two or more reflections
         facing = _facing(faces, bounds, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
         return cls(
             faces=faces, bounds=bounds, facing=facing, tolerance_m=tolerance_m, max_depth=max_depth, budget=budget
@@ -486,7 +488,7 @@ class Growth:
         highest = [(normal @ targets_m[start : start + TARGETS_AT_ONCE].T).max(axis=1) for start in starts]
         lit = np.max(highest, axis=0) - self.faces.offset_m >= -self.tolerance_m
         low, high = targets_m.min(axis=0), targets_m.max(axis=0)
-        # use the box round all poses: a beam that misses the box misses every pose
+        # use the box around all poses: a beam that misses the box misses every pose
         hull = (low + high)[None] / 2, np.diag(high - low)[None] / 2
         return [levels[0], *(self._reaching(level, lit, hull) for level in levels[1:])]
 
@@ -497,17 +499,18 @@ class Growth:
         return levels[1].faces[:, 0] if len(levels) > 1 else np.zeros(0, np.int64)
 
     def _one_face_longer(self, level: Sequences, source: FloatArray, usable: BoolArray, left: int) -> Sequences:
-        """Return the sequences that are one face longer. At most ``left`` are allowed."""
+        """Return the sequences that are longer by one face. At most ``left`` of them are allowed."""
         faces, box, depth = self.faces, self.bounds, level.faces.shape[1]
         grown: list[IntArray] = []
         images: list[FloatArray] = []
-        # eight arrays of this size exist at the same time
+        # divide by 8, because eight arrays of this size exist at the same time
         step = max(1, CELLS_PER_CHUNK // (8 * len(faces)))
         for start in range(0, len(level.faces), step):
             now, past = level.faces[start : start + step], level.images_m[start : start + step]
             last_image = past[:, -1] if depth else np.broadcast_to(source, (len(now), 3))
             height = last_image @ faces.normal.T - faces.offset_m
-            # the source itself may lie on the face, but not an image, whose reflection would be at an edge of two faces
+            # the source may lie on the face, but an image may not: its reflection would be at the edge between two
+            # faces
             good = usable & (height > self.tolerance_m if depth else height >= -self.tolerance_m)
             hit = good & self.facing[now[:, -1]] if depth else good
             row, face = np.divmod(np.flatnonzero(hit), len(faces))
@@ -515,10 +518,11 @@ class Growth:
                 before = now[row, -1]
                 beam = last_image[row], box.corners_m[before], box.centre_m[face], box.reach_m[face]
                 keep = _beam_meets(*beam, self.tolerance_m)
-                # keep the ground: every downward beam meets it, and the corners at which it is cut are not its outline
+                # always keep the ground: every downward beam hits it, and its corners are only those at which it was
+                # cut off
                 keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[before, 0])
                 row, face = row[keep], face[keep]
-            # the image is the same for every target, so it is computed once per sequence
+            # compute the image once per sequence, because it is the same for every target
             mirrored = last_image[row] - 2.0 * height[row, face][:, None] * faces.normal[face]
             grown.append(np.concatenate([now[row], face[:, None]], axis=1))
             images.append(np.concatenate([past[row], mirrored[:, None]], axis=1))
@@ -535,7 +539,7 @@ class Growth:
     def _reaching(self, level: Sequences, lit: BoolArray, hull_m: tuple[FloatArray, FloatArray]) -> Sequences:
         """Return the sequences whose last face is ``lit`` by a target, and whose beam reaches the box of the targets.
 
-        ``hull_m`` (1, 3), (1, 3, 3) is the centre of that box, and half of each of its sides.
+        ``hull_m`` (1, 3), (1, 3, 3) contains the centre of that box, and half of each side.
         """
         last = level.faces[:, -1]
         keep = lit[last]
@@ -547,7 +551,7 @@ class Growth:
 
 
 def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
-    """Return a mask of pairs (first, second) of faces that each have a point in front of the other."""
+    """Return a mask of pairs (first, second) of faces that each have a point in front of the other face."""
     highest = faces.normal @ box.centre_m.T - faces.offset_m[:, None]
     for half in box.reach_m.transpose(1, 2, 0):
         highest += np.abs(faces.normal @ half)
@@ -558,12 +562,13 @@ def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
 def _beam_meets(
     apex: FloatArray, window: FloatArray, centre: FloatArray, reach: FloatArray, tolerance_m: float
 ) -> BoolArray:
-    """Check whether the beam from ``apex`` through the quadrilateral ``window`` may meet a parallelogram or a box.
+    """Check whether the beam from ``apex`` through the quadrilateral ``window`` may hit a parallelogram or a box.
 
-    apex (n, 3), window (n, 4, 3), centre (n or 1, 3), reach (n or 1, axes, 3): half of each side. Conservative: the
-    result is False only if the target is completely outside one side plane of the beam.
+    ``apex`` (n, 3), ``window`` (n, 4, 3), ``centre`` (n or 1, 3), and ``reach`` (n or 1, axes, 3), which is half of
+    each side. The test is conservative: the result is False only if the target is completely outside one side plane of
+    the beam.
     """
-    # components first, then corners: each step is one pass over contiguous rows of sequences
+    # put components first, then corners, so that each step is a pass over contiguous rows of sequences
     ray = np.ascontiguousarray((window - apex[:, None, :]).transpose(2, 1, 0))
     following = ray[:, _NEXT_CORNER]
     side = ray[_SECOND] * following[_THIRD] - ray[_THIRD] * following[_SECOND]
@@ -571,7 +576,7 @@ def _beam_meets(
     sense = np.sign((side.sum(axis=1) * ray.sum(axis=1)).sum(axis=0))
     ahead = (side * (centre - apex).T[:, None]).sum(axis=0) * sense
     ahead += np.abs((side * reach.transpose(1, 2, 0)[:, :, None]).sum(axis=1)).sum(axis=0)
-    # side planes are not normalised, so the tolerance is multiplied by their length
+    # the normals of side planes are not unit vectors, so multiply the tolerance by their length
     size = np.sqrt((side * side).sum(axis=0))
     return np.asarray((ahead >= -tolerance_m * size).all(axis=0))
 
@@ -604,7 +609,7 @@ def _paths_of_level(
                 )
             else:
                 row, column = np.zeros(len(some), np.int64), np.arange(len(some))
-            # use take, which needs a quarter of the time of indexing with brackets for rows of three numbers
+            # use take: for rows of three numbers, it needs a quarter of the time of indexing with brackets
             sequence, images, pose = level.faces[part].take(row, 0), level.images_m[part].take(row, 0), some[column]
             # trace only the few pairs that passed the fast test of the last face
             vertices, good = trace_back(faces, sequence, images, targets.take(pose, 0), hiding.tolerance_m)
@@ -618,10 +623,10 @@ def _paths_of_level(
 def _meets_last_face(
     faces: Faces, sequence: IntArray, image: FloatArray, targets: FloatArray, tolerance_m: float
 ) -> tuple[IntArray, IntArray]:
-    """Return the pairs (sequence, target) whose line from the last image meets the bounds of the last face.
+    """Return the pairs (sequence, target) whose line from the last image is within the bounds of the last face.
 
-    The in-plane coordinates of the meeting point are linear in those of the target, which are shared by all
-    sequences that end on the face.
+    The in-plane coordinates of the intersection are linear in those of the target, which are the same for all sequences
+    that end on the face.
 
     Parameters
     ----------
@@ -630,9 +635,9 @@ def _meets_last_face(
     image : (s, 3)
         Image of the source in all faces of the sequence [m].
     targets : (n, 3)
-        [m].
+        Positions of the targets [m].
     tolerance_m : float
-        The bounds are enlarged by this distance [m].
+        Distance by which the bounds are enlarged [m].
 
     Returns
     -------
@@ -646,7 +651,7 @@ def _meets_last_face(
     with np.errstate(divide="ignore", invalid="ignore"):
         share = below[:, None] / (below[:, None] - height)
     good = height >= -tolerance_m
-    # the point of a target behind the face is meaningless
+    # for a target behind the face, the intersection has no meaning
     share[~good] = 0.0
     for axis, which in ((faces.along, 0), (faces.across, 1)):
         start = np.einsum("ij,ij->i", axis[last], image)[:, None]
@@ -657,14 +662,16 @@ def _meets_last_face(
         good &= point >= faces.lower[last, which, None] - tolerance_m
         good &= point <= faces.upper[last, which, None] + tolerance_m
     if sequence.shape[1] > 1:
-        # every line meets the ground as its last face, and tracing all of them back would take most of a search
+        # if the last face is the ground, nearly every line hits it, and tracing all lines back would take most of the
+        # search
         often = np.flatnonzero(good.sum(axis=1) > _OFTEN * len(targets))
         good[often] &= _passes_first_faces(faces, sequence[often], image[often], targets)
     row, column = np.divmod(np.flatnonzero(good), len(targets))
     return row, column
 
 
-# Share of the targets above which the first faces of a sequence are tested for all targets at once.
+# If the share of targets that pass the test of the last face exceeds this, the first faces of the sequence are tested
+# for all targets at once.
 _OFTEN = 0.1
 
 # If the heights of both ends over a plane differ by less than this [m], the reflection point is uncertain.
@@ -672,9 +679,9 @@ _SURE_M = 1e-4
 
 
 def _passes_first_faces(faces: Faces, sequence: IntArray, image: FloatArray, targets: FloatArray) -> BoolArray:
-    """Check, with a margin, whether lines (sequences, targets) from the last images may meet all faces but the last.
+    """Check, with a margin, whether lines (sequences, targets) from the last images may hit all faces except the last.
 
-    Each face is mirrored at the faces after it, so that the path is one straight line.
+    Each face is mirrored at the faces after it, so that the path is a straight line.
     """
     good = np.ones((len(sequence), len(targets)), dtype=np.bool_)
     for step in range(sequence.shape[1] - 1):
@@ -694,7 +701,7 @@ def _passes_first_faces(faces: Faces, sequence: IntArray, image: FloatArray, tar
                 place = start + share * (end - start)
                 meets &= place >= faces.lower[face, which, None] - REACH_SLACK_M
                 meets &= place <= faces.upper[face, which, None] + REACH_SLACK_M
-        # keep the pair if the reflection point is uncertain, because exact tracing decides later
+        # keep the pair if the reflection point is uncertain, because it is traced exactly later
         good &= meets | (abs(below - height) < _SURE_M)
     return good
 
@@ -720,7 +727,7 @@ def trace_back(
     tolerance_m : float
         Tolerance of side tests [m].
     edge_m : float, optional
-        How far outside its face a point may lie (default: ``tolerance_m``).
+        Largest distance of a point outside its face [m]. Default: ``tolerance_m``.
 
     Returns
     -------
@@ -757,13 +764,13 @@ def retraced(
     tolerance_m: float,
     edge_m: float | None = None,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the reflection points of sequences of any length, and which of them form a path if obstacles are ignored.
+    """Return the reflection points of sequences of any length, and which sequences are paths if obstacles are ignored.
 
     Parameters
     ----------
     faces : Faces
     sequence : (paths, most) int
-        Faces from the source on, -1 where unused.
+        Faces in order from the source, -1 where unused.
     sources_m, targets_m : (paths, 3)
         Ends [m].
     tolerance_m, edge_m : float
@@ -772,7 +779,7 @@ def retraced(
     Returns
     -------
     vertices_m : (paths, most, 3)
-        NaN where unused.
+        Reflection points [m], NaN where unused.
     good : (paths,) bool
     """
     depth, vertices = (sequence >= 0).sum(axis=1), np.full((*sequence.shape, 3), np.nan)
@@ -811,7 +818,7 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
     Returns
     -------
     PathSet
-        Sorted by pose, tower, depth, faces.
+        Paths, sorted by pose, tower, depth and faces.
     """
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
@@ -838,31 +845,31 @@ def _order(paths: PathSet) -> IntArray:
 def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
     """Return a mask (paths,) of paths that have the same ends and planes as an earlier path in ``order``."""
     plane = planes_of(faces)
-    # most scenes have no two faces in a plane, and then no path can repeat
+    # a path can repeat only if two faces lie in one plane, which is not the case in most scenes
     shared = np.append(np.bincount(plane)[plane] > 1, False)
     repeated = np.zeros(len(paths), dtype=np.bool_)
     rows = order[shared[paths.faces[order]].any(axis=1)] if shared.any() else order[:0]
     if len(rows):
         same = np.append(plane, -1)[paths.faces[rows]]
         key = np.column_stack([paths.pose[rows], paths.tower[rows], same])
-        # unique returns the first of equal rows
+        # do not mark the first of equal rows, which unique returns
         repeated[rows] = True
         repeated[rows[np.unique(key, axis=0, return_index=True)[1]]] = False
     return repeated
 
 
 def planes_of(faces: Faces) -> IntArray:
-    """Return the number (faces,) of each face's plane. Coplanar faces with the same orientation share it."""
-    # coplanar within the rounding of a map: 1e-9 of tilt and a micrometre of offset
+    """Return the plane number (faces,) of each face. Coplanar faces with the same orientation have the same number."""
+    # faces are coplanar within the rounding errors of a map: a tilt of 1e-9 and an offset of a micrometre
     key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round() + 0.0
     return np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def plane_keys(paths: PathSet, planes: IntArray) -> list[tuple[int, ...]]:
-    """Return a key (pose, tower, planes) of each path, which is equal for the same path. ``planes`` has shape (faces,).
+    """Return a key (pose, tower, planes) of each path, which is equal for equal paths. ``planes`` has shape (faces,).
 
     Keys do not contain unused entries, because two sets may have different depths.
     """
     rows = np.column_stack([paths.pose, paths.tower, np.append(planes, -1)[paths.faces]])
-    # tuples, so that they can be members of sets
+    # use tuples, which can be members of sets
     return [tuple(number for number in row if number >= 0) for row in rows.tolist()]

@@ -1,18 +1,18 @@
 """A path finder with Sionna RT. This is the only file that imports sionna, mitsuba and drjit.
 
-Sionna computes in float32 and finds paths by sampling. Only *which faces a path meets* is taken from Sionna. Reflection
-points come from the image method in float64 and fields from :mod:`aerpaw_cmp.propagation.field.sum`.
+Sionna computes in float32 and finds paths by sampling. Only *the sequence of faces of a path* is taken from Sionna.
+Reflection points are computed by the image method in float64, and fields by :mod:`aerpaw_cmp.propagation.field.sum`.
 
-Guards against silent behaviour of Sionna RT 2.2.0:
+This module guards against silent errors of Sionna RT 2.2.0:
 
 - Its hash table of candidates is shared by all receivers of a call and loses paths. Therefore this module uses a table
   of 2**24 slots and batches of at most 100 poses.
-- It drops candidates past ``max_num_paths_per_src``, most of which are not paths in the end, and corrupts memory if
-  that limit is below the number of receivers. Its own count of candidates is read after each batch. A batch that
-  exceeded the limit, or filled too much of the table, is searched again with larger limits.
-- Positions given as numbers recompile kernels. Positions are therefore arrays here, and each batch has the same size
-  (the last batch is padded).
-- A line of sight without Friis' amplitude, or a path with a gain above one, stops the run.
+- It drops candidates beyond ``max_num_paths_per_src``, most of which are not paths in the end. It corrupts memory if
+that limit is below the number of receivers. Sionna's own count of candidates is therefore read after each batch. If a
+batch exceeded the limit, or filled too much of the table, it is searched again with larger limits. - If positions are
+given as numbers, kernels are compiled again for each position. Positions are therefore arrays here, and each batch has
+the same size (the last batch is padded). - A line of sight without Friis' amplitude, or a path with a gain above one,
+stops the run.
 """
 
 from __future__ import annotations
@@ -39,37 +39,38 @@ from .mirror import MINIMUM_LENGTH_M, merge, planes_of, retraced, scene_toleranc
 
 SPECULAR_TABLE_SLOTS = 2**24
 _FEWEST_SLOTS = 2**20
-# Initial number of candidates per tower and batch: the actual number is known only afterwards.
+# Initial limit on the number of candidates per tower and batch. The actual number is known only afterwards.
 MAXIMUM_PATHS = 2**16
 
-# Number of candidates above which a batch is refused (some 100 bytes each).
+# Number of candidates above which a batch is refused. A candidate needs about 100 bytes.
 _MOST_CANDIDATES = 2**25
 
-# Share of the table that candidates may fill. Each has two hashes, so about twice this share is lost.
+# Share of the table that candidates may fill. Each candidate has two hashes, so the share of lost candidates is about
+# twice this.
 _FULLEST_TABLE = 1 / 32
 
-# Slots of the table, over all towers of a call (two tables of 4 bytes each).
+# Largest number of slots of the table, over all towers of a call. A slot needs 4 bytes in each of two tables.
 _MOST_SLOTS = 2**28
 
 _LARGEST_BATCH = 100
-# Thickness of a half-space for Sionna, which supports only slabs: a slab this thick has no second echo. H does not use
-# Sionna's coefficients.
+# Thickness of a half-space for Sionna, which supports only slabs: a slab this thick has no second echo. H is not
+# computed from Sionna's coefficients.
 HALF_SPACE_THICKNESS_M = 10.0
-# A float32 reflection point may lie this far outside its face.
+# Largest distance of a float32 reflection point outside its face [m].
 _EDGE_TOLERANCE_M = 1e-3
 
-# Scenes in use. Dr.Jit compiles virtual calls for every existing material, including materials of unused scenes. It may
-# then define a function twice and abort the process, so no old scene may exist when the next scene is created.
+# Scenes in use. No old scene may exist when the next scene is created: Dr.Jit compiles virtual calls for every existing
+# material, including materials of unused scenes, and may then define a function twice and abort the process.
 _ALIVE: WeakSet[Any] = WeakSet()
 
-# Variants of Mitsuba, the preferred one first.
+# Variants of Mitsuba, the preferred variant first.
 _VARIANTS = ("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
 
 
 def load_variant() -> str:
     """Choose CUDA if there is a GPU, else LLVM, and return the name of the variant.
 
-    A variant that is already set is kept, because a change would leave objects of two kinds alive.
+    A variant that is already set is kept, because after a change, objects of two kinds would exist.
 
     Raises
     ------
@@ -87,7 +88,7 @@ def load_variant() -> str:
         import mitsuba as mi
     except Exception as error:
         raise _missing(error) from error
-    # Mitsuba searches the working folder first for plugins, which are native code, possibly from a third party
+    # Mitsuba first searches the working folder for plugins. These are native code, possibly from a third party.
     resolver: Any = mi.file_resolver
     resolver().clear()
     resolver().append(str(Path(mi.__file__).parent))
@@ -126,7 +127,7 @@ class _Scene:
 class _Builder:
     """A builder of Sionna scenes from some of the faces, with one mesh per material.
 
-    With ``own_table`` a scene has Sionna's own constants of P.2040.
+    With ``own_table``, a scene has Sionna's own constants of P.2040.
     """
 
     faces: Faces
@@ -144,12 +145,12 @@ class _Builder:
         except Exception as error:
             raise _missing(error) from error
         if _ALIVE:
-            gc.collect()  # an exception may still refer to a scene
+            gc.collect()  # an exception may still keep a scene alive
         scene, faces = rt.load_scene(), self.faces
         _ALIVE.add(scene)
         scene.frequency = self.carrier_hz
         ends = np.concatenate([self.links.sources_m, self.links.targets_m])
-        # extend only as far as reflections can lie, because float32 coordinates become coarse
+        # extend the ground only as far as reflections can be, because float32 coordinates become coarse
         reach = 4.0 * float(max(np.nanmax(np.abs(ends)), 100.0))
         vertices, triangle, owner = triangles(faces, reach) if self.surfaces is None else self.surfaces.mesh()
         objects, owners = [], []
@@ -158,12 +159,12 @@ class _Builder:
             rows = np.flatnonzero(np.isin(owner, members))
             plain = f"faces-{_plain(name)}"
             material = _material(name, self.carrier_hz, self.own_table)
-            # one mesh per material, not per face: Dr.Jit compiles for the contents of a scene
+            # create a mesh per material, not per face, because Dr.Jit compiles code for the contents of a scene
             mesh = self._mesh(plain, vertices, triangle[rows])
             objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
             owners.append(owner[rows])
         scene.edit(add=objects)
-        # pass as data, because literals would be compiled again for each carrier
+        # pass the values as data, because code with literals would be compiled again for each carrier
         materials = scene.radio_materials.values()
         dr.make_opaque(scene.frequency, *((m.relative_permittivity, m.conductivity) for m in materials))
         return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
@@ -198,7 +199,7 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
 
         if name.partition(" with ")[0] in ITU_MATERIALS_PROPERTIES:
             return rt.ITURadioMaterial(f"m-{plain}", name.partition(" with ")[0], thickness=thick)
-    # Sionna expects the conductivity [S/m], which it divides by omega eps0
+    # convert to the conductivity [S/m] that Sionna expects
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
         f"m-{plain}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
@@ -206,9 +207,9 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
 
 
 def _slots(built: _Scene, targets: int) -> int:
-    """Return the number of slots of PathSolver's table. Bare ground needs fewer, because there are few candidates.
+    """Return the number of slots of PathSolver's table. Bare ground needs fewer, as there are few candidates.
 
-    About ``2 n^2 / slots`` of n candidates are lost: less than one in two hundred batches.
+    Of n candidates, about ``2 n^2 / slots`` are lost: less than one in two hundred batches.
     """
     mirrors = sum(len(np.unique(faces)) for faces in built.face_of.values())
     slots = 400.0 * (targets * max(mirrors, 1) ** 2) ** 2
@@ -218,7 +219,7 @@ def _slots(built: _Scene, targets: int) -> int:
 def _points(values: FloatArray) -> Any:
     import mitsuba as mi
 
-    # use lists, because Dr.Jit would use NumPy's memory directly and compile again for each alignment
+    # use lists: Dr.Jit would use the memory of NumPy arrays directly, and compile again for each alignment
     return mi.Point3f(*(mi.Float(column) for column in values.T.astype(np.float32).tolist()))
 
 
@@ -261,7 +262,7 @@ class _Finder:
     sources : _Ends
     batch : int
     patterns : (str, str)
-        Sionna's names of the elements' patterns at the sources and at the targets.
+        Sionna's names for the patterns of the elements at the sources and at the targets.
     """
 
     def __init__(
@@ -277,7 +278,7 @@ class _Finder:
             pattern = rt.antenna_pattern.antenna_pattern_registry.get(kind)(polarization="VH")
             setattr(scene, name, rt.AntennaArray(pattern, _points(np.zeros((1, 3)))))
         for i in range(len(sources.centres_m)):
-            # Sionna only counts these devices; their positions are set later as arrays
+            # the positions do not matter: Sionna only counts these devices, and their positions are set later as arrays
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
@@ -305,7 +306,7 @@ class _Finder:
         generator._shoot_and_bounce = watched
 
     def _share_kernels(self) -> None:
-        """Pass ray directions to kernels as data. A new number of rays would otherwise require new kernels."""
+        """Pass ray directions to kernels as data. Otherwise, a new number of rays would require new kernels."""
         import drjit as dr
         import sionna.rt.path_solvers.sb_candidate_generator as generator
         from sionna.rt.utils import fibonacci_lattice
@@ -321,7 +322,7 @@ class _Finder:
         self.solver._field_calculator = lambda **named: field(**named | {"samples_per_src": 1})
 
     def _replace_endpoints(self, towers: int) -> None:
-        """Give PathSolver arrays of positions, because positions of devices would be literals in the kernels."""
+        """Give PathSolver arrays of positions, because the positions of devices would be literals in the kernels."""
         import drjit as dr
         import mitsuba as mi
 
@@ -338,12 +339,12 @@ class _Finder:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Remove the references between scene and finder, so that both are freed with their last user."""
+        """Remove the references between scene and finder, so that both are freed after their last use."""
         scene = self.built.scene
         del scene.sources, scene.targets
         for name in (*scene.transmitters, *scene.receivers):
             scene.remove(name)
-        scene.edit(remove=list(scene.objects))  # the only way to remove an object before Sionna RT 2.2
+        scene.edit(remove=list(scene.objects))  # before Sionna RT 2.2, this was the only way to remove an object
         self.built, self.solver = None, None  # type: ignore[assignment]
 
     def trace(self, targets: _Ends, search: Search) -> Any:
@@ -411,7 +412,7 @@ class _Finder:
 
 
 def _arrays(paths: Any, count: int) -> dict[str, Any]:
-    """Return the validity of Sionna's paths of the first ``count`` targets, and what they meet."""
+    """Return the validity of Sionna's paths to the first ``count`` targets, and the objects that they hit."""
     return {
         "valid": paths.valid.numpy()[:count],
         "kind": paths.interactions.numpy()[:, :count],
@@ -456,13 +457,13 @@ def find_paths(
     carrier_hz : float
         Carrier frequency. Sionna samples rays by reflected power, so the materials at this frequency affect its search.
     surfaces : Surfaces, optional
-        Surfaces of the faces, if they are open surfaces.
+        Triangles of the faces, if they are open surfaces.
     progress : callable, optional
 
     Returns
     -------
     PathSet
-        Sorted by pose, tower, depth, faces.
+        Paths, sorted by pose, tower, depth and faces.
     """
     sources_m, targets_m, batch = links.sources_m, links.targets_m, search.batch
     if not 1 <= batch <= _LARGEST_BATCH:
@@ -526,14 +527,15 @@ def own_coefficients(
     """Return Sionna's complex coefficient of each path, for the audit of the field.
 
     Sionna supplies its constants of P.2040, rotations, patterns, slants, Fresnel coefficients and spreading. Only the
-    carrier phase is computed here from the path length in float64, since Sionna would form ``2 pi f tau`` in float32.
+    carrier phase is computed here, from the path length in float64, because Sionna would compute ``2 pi f tau`` in
+    float32.
 
     Parameters
     ----------
     faces, links, search, surfaces
         The same as in :func:`find_paths`.
     probe : Link
-        Link with two elements of one pattern in each array's centre.
+        Link with two elements of one pattern at the centre of each array.
     turns : ((towers, 3, 3), (poses, 3, 3))
         Rotations from device to site, for the towers' arrays and for the UAV's array at each pose.
 
@@ -578,7 +580,7 @@ def own_coefficients(
 def _raw_paths(
     finder: _Finder, target: _Ends, poses: IntArray, towers: IntArray, search: Search
 ) -> tuple[PathSet, ComplexArray]:
-    """Return paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
+    """Return the paths of one batch that consist of reflections only, and their gains (paths, V and H, V and H)."""
     traced = finder.trace(target, search)
     real, imaginary = (np.asarray(part.numpy()) for part in traced.a)
     raw = _arrays(traced, len(poses))
@@ -592,7 +594,7 @@ def _raw_paths(
 
 
 def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield (towers, faces) that can share a scene, because they see the same ground."""
+    """Yield (towers, faces) that can share a scene, because the towers have the same ground."""
     if usable is None:
         yield np.arange(len(sources_m)), np.arange(len(faces))
         return
@@ -609,7 +611,7 @@ def _check_gain(raw: dict[str, Any], sources_m: FloatArray, targets_m: FloatArra
     receiver, tower, _ = np.nonzero(direct)
     distance = np.linalg.norm(targets_m[receiver] - sources_m[tower], axis=1)
     expected = wavelength_m(carrier_hz) / (4.0 * np.pi * np.maximum(distance, MINIMUM_LENGTH_M))
-    # a V/H pair at both ends sees the wave twice: |a|^2 sums to 2 (lambda / 4 pi d)^2
+    # with V/H pairs at both ends, the wave is counted twice: |a|^2 sums to 2 (lambda / 4 pi d)^2
     ratio = raw["gain"][direct] / (np.sqrt(2.0) * expected)
     if len(ratio) and (np.abs(ratio - 1.0) > 1e-2)[distance > 1.0].any():
         raise CheckError("Sionna's line of sight differs from Friis by more than 1 %", cause="a damaged installation")
@@ -649,7 +651,7 @@ def _refine(
 ) -> PathSet:
     """Compute reflection points in float64, and drop paths whose points miss their faces."""
     rows = np.column_stack([pose, tower, sequence])
-    # rays that differ by rounding report one path several times
+    # several rays may report the same path with different rounding errors, so remove duplicates
     rows = np.unique(rows, axis=0) if len(rows) else rows
     pose, tower, sequence = rows[:, 0], rows[:, 1], rows[:, 2:]
     depth, sources, targets = (sequence >= 0).sum(axis=1), sources_m[tower], targets_m[pose]
@@ -674,7 +676,7 @@ def _refine(
 def _relocate(
     faces: Faces, sources_m: FloatArray, targets_m: FloatArray, sequence: IntArray, tolerance_m: float
 ) -> IntArray:
-    """Replace each face by the coplanar face with the reflection point, because Sionna reports any face of a plane."""
+    """Replace each face by the coplanar face with the reflection point, because Sionna reports any face in a plane."""
     plane = planes_of(faces)
     if len(np.unique(plane)) == len(plane) or not len(sequence):
         return sequence
@@ -688,6 +690,6 @@ def _relocate(
             point = np.tile(everywhere[row, step], (len(twins), 1))
             holding = twins[inside(faces, twins, point, _EDGE_TOLERANCE_M)]
             if len(holding):
-                # any face is correct: merge() keeps one of overlapping coplanar faces
+                # any of the faces is correct, because merge() keeps only one of several overlapping coplanar faces
                 result[row, step] = holding[-1]
     return np.asarray(result)

@@ -1,13 +1,13 @@
 """Reflections off the ground of an elevation model.
 
-At a specular point the length of the path over the ground is stationary. Along the profile between the ends the ground
-is a polyline. Its pieces are mirrors in closed form, and the length can also be stationary at a crease between two
-pieces. Across the profile the point is found by iteration on the bilinear surface. Points whose path lengths differ by
-less than half a wavelength lie in one Fresnel zone and count as one mirror, which is the mirror of the shortest path.
-Its plane is tangent to the surface; on a crease it is the plane between both sides that mirrors one end into the other.
-Where curved ground leaves the Fresnel zone of that plane, the reflection is reduced to the part of the zone that
-remains along the profile. It is never focused, and the crest of a ridge reflects nothing. Level ground at the height of
-the tower's ground is the same plane as without an elevation model.
+At a specular point the length of the path over the ground is stationary. Along the profile between the ends, the ground
+is a polyline. Specular points on its pieces have a closed form, and the length can also be stationary at a crease
+between two pieces. Across the profile, the point is found by iteration on the bilinear surface. Points whose path
+lengths differ by less than half a wavelength lie in one Fresnel zone and count as one mirror, that of the shortest
+path. The plane of the mirror is tangent to the surface. On a crease, it is the plane between both sides that mirrors
+one end into the other. Where curved ground leaves the Fresnel zone of that plane, the reflection is reduced to the part
+of the zone that remains along the profile. The reflection is never focused, and the crest of a ridge does not reflect.
+Level ground at the height of the tower's ground is the same plane as without an elevation model.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from ...site.relief import Dem
 from ..geometry import Faces, Links, PathSet, joined, legs
 from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, retraced, searched_links
 
-# ``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1.
+# Value of ``solid`` for tangent planes of the terrain. For the level ground of a tower, it is -1.
 TERRAIN = -2
 
 # A mirror is ignored if the ground fills a smaller part of its Fresnel zone than this.
-# At this part, the reflection is 20 dB below that of a complete mirror.
+# With this part, the reflection is 20 dB weaker than that of a complete mirror.
 _SMALLEST_PART = 0.1
 
-# Number of iterations after which a point that still moves is treated like a crease.
+# Number of iterations. A point that still moves afterwards is treated like a crease.
 _STEPS = 8
 _STILL_M = 1e-6
 
@@ -45,7 +45,7 @@ def on_terrain(
     links : Links
     paths : PathSet
         Paths over level ground, at most ``paths.faces.shape[1]`` reflections. A path over the ground and a wall is only
-        searched if it exists on level ground, too.
+        searched for if it also exists on level ground.
     wavelength_m : float
 
     Returns
@@ -93,7 +93,7 @@ def on_terrain(
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Sequences (n, depth) of faces with the ground plane of the tower once, and the row of the engine's path or -1."""
+    """Sequences (n, depth) of faces that contain the tower's ground once, and the row of the engine's path or -1."""
 
     pose: IntArray
     tower: IntArray
@@ -119,7 +119,7 @@ class _Candidates:
             material=tuple(faces.material[f] for f in mine.tolist()),
             label=("terrain",) * len(where),
         )
-        # change the array in place: the record is frozen, but its array is not shared
+        # the record is frozen, but its array is not shared, so the array can be changed in place
         plain.solid[:] = TERRAIN
         every = joined(faces, plain)
         sequence = self.sequence[where].copy()
@@ -158,8 +158,8 @@ def _ends_seen_from(
 def _clear(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_m: float) -> BoolArray:
     """Check which paths with one ground reflection have no leg that the terrain blocks.
 
-    Ground that rises into a leg by little counts as roughness and does not block it. The rise must be less than the
-    height of Rayleigh's criterion at the reflection, and less than the radius of the Fresnel zone.
+    Ground that rises only slightly into a leg counts as roughness and does not block the leg. The rise must be less
+    than the height of Rayleigh's criterion at the reflection, and less than the radius of the Fresnel zone.
     """
     source, target = links.sources_m[paths.tower], links.targets_m[paths.pose]
     points, row = paths.vertices_m, np.arange(len(paths))
@@ -186,7 +186,7 @@ def specular_points(
     ----------
     dem : Dem
     source_m, target_m : (pairs, 3)
-        [m]
+        Ends [m].
     wavelength_m : float
 
     Returns
@@ -196,7 +196,7 @@ def specular_points(
     normal : (points, 3)
         Normal of the tangent plane, upward.
     part : (points,)
-        Share of the plane's Fresnel zone that the ground fills along the profile, at most 1.
+        Share of the Fresnel zone of the plane that the ground fills along the profile, at most 1.
     """
     none = np.zeros(0)
     pieces: list[tuple[IntArray, FloatArray, BoolArray, FloatArray]] = [(none.astype(int), none, none > 0.0, none)]
@@ -216,7 +216,7 @@ def _stationary(
     along = share * length
     up = source[:, 2], target[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.diff(ground, axis=0) / np.diff(along, axis=0)  # NaN where a shorter profile repeats its end
+        slope = np.diff(ground, axis=0) / np.diff(along, axis=0)  # NaN where a shorter profile repeats its last point
 
         def growth(d: FloatArray, z: FloatArray) -> FloatArray:
             """Return the derivative of the path length over the ground along the profile."""
@@ -225,10 +225,10 @@ def _stationary(
             after = (d - length + slope * (z - up[1])) / np.maximum(from_target, 1e-12)
             return np.asarray(before + after)
 
-        # evaluate it at both ends of each piece of the profile, between which it changes its sign at most once
+        # evaluate the derivative at both ends of each piece of the profile. Its sign changes at most once in a piece.
         ends = [growth(along[:-1], ground[:-1]), growth(along[1:], ground[1:])]
     turns = np.stack(ends, axis=1).reshape(-1, len(source))
-    # a change of sign within a piece is a mirror in it; between two pieces it is a mirror in their crease
+    # a change of sign within a piece means a mirror on the piece; between two pieces, it means a mirror on the crease
     falls, known = turns < 0.0, np.isfinite(turns)
     column, entry = np.nonzero(((falls[1:] != falls[:-1]) & known[1:] & known[:-1]).T)
     piece, crease = entry // 2, entry % 2 == 1
@@ -245,7 +245,7 @@ def _stationary(
     good = crease | ((over[0] > 0.0) & (over[1] > 0.0))
     column, d, z, crease, way = column[good], d[good], z[good], crease[good], way[good]
     zone = np.cumsum((np.diff(column, prepend=-1) != 0) | (np.abs(np.diff(way, prepend=0.0)) >= wavelength_m / 2.0))
-    # within a Fresnel zone keep the shortest path, which sorts first (Fermat)
+    # within a Fresnel zone, keep the shortest path, which comes first in this order (Fermat)
     order = np.lexsort((way, zone))
     first = order[np.flatnonzero(np.diff(zone[order], prepend=-1))]
     column, d, z, crease, way = column[first], d[first], z[first], crease[first], way[first]
@@ -264,7 +264,7 @@ def _stationary(
         for up in (ground[:, column], z + lean * (at - d))
     ]
     part = np.minimum(widths[0] / np.maximum(widths[1], 1e-12), 1.0)
-    # level ground must be exactly 1, so that its original plane is kept
+    # the value for level ground must be exactly 1, so that its original plane is kept
     part = np.where(part > 1.0 - 1e-9, 1.0, part)
     good = part >= _SMALLEST_PART
     return column[good], d[good], crease[good], part[good]
@@ -295,7 +295,7 @@ def _zone_m(along: FloatArray, at: FloatArray, excess_m: FloatArray, wavelength_
 def _settled(
     dem: Dem, source: FloatArray, target: FloatArray, along: FloatArray, crease: BoolArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Move mirrors from the profile to the surface. Return points, normals, and whether both ends are above."""
+    """Move mirrors from the profile to the surface. Return points, normals, and whether both ends are above it."""
     way = target[:, :2] - source[:, :2]
     way = way / np.maximum(np.hypot(*way.T), 1e-12)[:, None]
     begin = source[:, :2] + along[:, None] * way
@@ -317,7 +317,7 @@ def _settled(
     rays = [end - place for end in (source, target)]
     between = sum(r / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), 1e-12) for r in rays)
     smooth = ~crease & (np.abs(moved).max(axis=1, initial=0.0) < _STILL_M)
-    # on a crease there is no tangent plane: use the plane that reflects one end to the other
+    # a crease has no tangent plane: use the plane that reflects one end to the other
     normal = np.where(smooth[:, None], tangent, between)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     above = [(r * normal).sum(axis=1) > 0.0 for r in rays]

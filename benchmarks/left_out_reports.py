@@ -145,8 +145,15 @@ def run(words: Sequence[object]) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-m", "aerpaw_cmp", *map(str, words)], capture_output=True, text=True)
 
 
-def located(log: Path, site: Path, folder: Path, rover: tuple[float, float]) -> list[tuple[float, float]]:
-    """Return errors and radii of ``locate`` [m], without learned antennas and with those of a site, and print them."""
+# Side of a cell of region.csv.
+_CELL_M = 5.0
+
+
+def located(log: Path, site: Path, folder: Path, rover: tuple[float, float]) -> list[tuple[float, float, float]]:
+    """Return errors and radii of ``locate`` [m], and distances of the node from the 90 % region [m], and print them.
+
+    The first row is without learned antennas, the second with those of a site.
+    """
     bare = folder / "bare.yaml"
     shutil.copyfile(site, bare)
     found = []
@@ -159,7 +166,9 @@ def located(log: Path, site: Path, folder: Path, rover: tuple[float, float]) -> 
         answer = json.loads(done.stdout)
         place = answer["position"]
         error_m = float(np.hypot(*SiteFrame(*rover).to_local(place["latitude_deg"], place["longitude_deg"])))
-        found.append((error_m, float(answer["region90_m"])))
+        cells = np.loadtxt(folder / "node" / "region.csv", delimiter=",", skiprows=1)
+        beyond_m = np.hypot(*SiteFrame(*rover).to_local(*cells.T[:2])).min()
+        found.append((error_m, float(answer["region90_m"]), float(beyond_m)))
         print(f"{log.name}, {name}: error {error_m:.1f} m, 90 % radius {found[-1][1]:.0f} m", flush=True)
     return found
 
@@ -298,7 +307,8 @@ def main() -> None:
                 text = ", ".join(f"{key} {sum(each) / len(each):.3f}" for key, each in means.items())
                 print(f"{name}, means over series: {text}", flush=True)
         for case, values in zip(("without", "with"), np.array(found).swapaxes(0, 1) if found else (), strict=False):
-            inside = int((values[:, 0] <= values[:, 1]).sum())
+            # half the diagonal of a cell
+            inside = int((values[:, 2] <= _CELL_M / np.sqrt(2.0)).sum())
             text = f"mean error {values[:, 0].mean():.1f} m, {inside} of {len(values)} inside the 90 % region"
             print(f"{case} learned antennas: {text}, largest radius {values[:, 1].max():.0f} m", flush=True)
         if not (asked.thirds or asked.raw or asked.only or asked.locate):

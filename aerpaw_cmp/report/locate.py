@@ -1,4 +1,4 @@
-"""The page locate.html with its metrics.json: a map of the regions that contain a ground node."""
+"""The page locate.html with metrics.json and region.csv: a map of the regions that contain a ground node."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ..common.units import FloatArray
 from ..compare.locate import Regions
@@ -37,10 +38,11 @@ def write_locate(
     """
     held, (east, north) = regions.likelier(), np.meshgrid(regions.east_m, regions.north_m, indexing="ij")
     inside = held < 0.9
+    east, north, held = east[inside], north[inside], 100.0 * held[inside]
     places = Places(
         name="region of the node",
-        at=np.column_stack([east[inside], north[inside], np.zeros(inside.sum())]),
-        values={"smallest region with this position [%]": 100.0 * held[inside]},
+        at=np.column_stack([east, north, np.zeros(len(east))]),
+        values={"smallest region with this position [%]": held},
         cell_m=float(regions.east_m[1] - regions.east_m[0]),
     )
     crosses = [np.array([[m["east_m"], m["north_m"]]]) + 8.0 * arm for m in numbers["modes"] for arm in _CROSS]
@@ -60,7 +62,10 @@ def write_locate(
                *[Card(title="Regions", id="places", tables=[table])] * (len(numbers["modes"]) > 1),
                Card(title="Assumptions", id="assumed", text=[numbers["assumed"]])],
     )  # fmt: skip
-    return write_page(folder, "locate", page, numbers)
+    latitude, longitude = site.frame.to_geographic(east, north)
+    cells = {"latitude_deg": latitude, "longitude_deg": longitude, "smallest_region_percent": held}
+    pd.DataFrame(cells).round(7).to_csv(folder / "region.csv", index=False, lineterminator="\n")
+    return [*write_page(folder, "locate", page, numbers), folder / "region.csv"]
 
 
 _CROSS = np.array([[[-1.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 1.0]]])

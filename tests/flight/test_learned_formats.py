@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.gains import ANTENNA_TERMS, link_directions, term_kernel
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.drafting.proposals import NodeFinder, searching_airframe
+from aerpaw_cmp.flight.drafting.proposals import NodeFinder, Nodes, propose, searching_airframe
 from aerpaw_cmp.flight.gains import sphere_angles
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
@@ -318,6 +318,24 @@ def test_a_flight_file_without_antennas_is_offered_the_same(tmp_path, capsys) ->
     ]
     assert main([*words, "--recommend", str(tmp_path / "best.yaml")]) == 0
     assert yaml.safe_load((tmp_path / "best.yaml").read_text())["antennas"] == names
+    capsys.readouterr()
+
+
+def test_an_airframe_is_compared_only_at_known_positions(tmp_path, capsys) -> None:
+    """At a position that was estimated from the levels, an airframe of another aircraft can fit them."""
+    draft, content = drafted(merged_mat, tmp_path, known_site(tmp_path))
+    del content["antennas"]
+    tower = SITE.towers["LW1"]
+    place = {"latitude_deg": tower.latitude_deg, "longitude_deg": tower.longitude_deg, "antenna_height_m": 10.0}
+    content |= {"towers": {"NODE": place}, "logs": [log | {"node": "NODE"} for log in content["logs"]]}
+    draft.write_text(yaml.safe_dump(content))
+    data = load_data(load_flight(draft), draft.parent)
+    known, unknown = (
+        propose(data, data.site_place, "mine", Nodes(placed=n)) for n in (frozenset({"NODE"}), frozenset())
+    )
+    assert known.antennas["uav"] == "mine/past_uav"
+    assert not unknown.antennas
+    assert unknown.antennas_about.endswith("NODE has an estimated position")
     capsys.readouterr()
 
 

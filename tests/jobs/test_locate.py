@@ -64,6 +64,10 @@ def test_the_node_lies_in_its_region_and_the_page_says_what_was_assumed(flight, 
     assert away < 60.0
     assert printed["region50_m"] < printed["region90_m"]
     assert sum(mode["share"] for mode in printed["modes"]) == pytest.approx(0.9, abs=0.02)
+    region = np.loadtxt(out / "region.csv", delimiter=",", skiprows=1)
+    assert region[:, 2].max() < 90.0
+    distance = np.hypot(*(np.array(site.frame.to_local(region[:, 0], region[:, 1])).T - tower[:2]).T)
+    assert distance.min() < 5.0
     html = (out / "locate.html").read_text()
     assert printed["sentence"] in html
     assert "Path-loss exponent" in html

@@ -577,7 +577,8 @@ def propose(
     """Return the learned antennas that the levels of a flight support, and the rank receiver of its tower.
 
     Antennas of both ends are compared with the levels of each series. If no pair fits, airframes alone are compared
-    with all series together. The antenna of a node of other flights is compared at any node with a well-known position.
+    with all series together, unless a node is at an estimated position. The antenna of a node of other flights is
+    compared at any node with a well-known position.
 
     Parameters
     ----------
@@ -610,8 +611,14 @@ def propose(
         evidence = gains.FlightEvidence([o.samples for o in observed])
         bands = (learned.BAND, learned.AIRFRAME_BAND) if carrier_known else (math.inf, math.inf)
         chosen = _antennas_for(data, levels, known, evidence, nodes, bands)
+        unsure = sorted({series.tower for series in levels}.difference(nodes.placed, nodes.fixed))
         if chosen.fits:
             found = chosen.proposal(site, evidence)
+        elif unsure:
+            # at a position that was estimated from the same levels, a wrong airframe can fit them
+            nodes_text = " and ".join(unsure)
+            text = f"learned airframes are compared only at known positions, and {nodes_text} has an estimated position"
+            found = Proposal(antennas_about=text)
         else:
             found = _airframe_for(data, known, site, evidence, band=bands[1])
         found = replace(found, receivers=_receivers(zip(levels, observed, strict=True), known, chosen))

@@ -12,6 +12,7 @@ import xarray
 import yaml
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.jobs import referee
@@ -66,6 +67,53 @@ def refused(flight: Path, file: Path, capsys: pytest.CaptureFixture[str]) -> str
     return " ".join(capsys.readouterr().err.split())
 
 
+@pytest.fixture(scope="module")
+def data(flight: Path) -> FlightData:
+    return flight_data(flight / "s" / "flight.yaml")
+
+
+def unread(file: Path, data: FlightData) -> str:
+    """Return the message about a file that the command refuses, without the command, which reads the flight again."""
+    with pytest.raises(AerpawCmpError) as caught:
+        referee.read_foreign(file, data)
+    return " ".join(str(caught.value).split())
+
+
+@pytest.fixture(scope="module")
+def cards(flight: Path) -> dict[str, dict]:
+    """The scores of several predictions in one report, by the names of their files."""
+    table = ours(flight)
+    noise_db = np.random.default_rng(5).normal(0.0, 8.0, len(table))
+    noisy = table[["time_utc", "tower", "channel"]].assign(level_db=table["measured_db"] + noise_db, sd_db=8.0)
+    first = table.query("tower == 'LW1' and channel == 'USRP1'")
+    half = first.iloc[: len(first) // 2]
+    half = half[["time_utc", "tower"]].assign(level_dbm=half["simulated_dbm"]).drop_duplicates("time_utc")
+    place = first.dropna(subset=["east_m", "simulated_dbm"])
+    place = place[["east_m", "north_m"]].assign(height_m=place["up_m"], level_dbm=place["simulated_dbm"])
+    place = place.drop_duplicates(["east_m", "north_m", "height_m"])
+    # a climb passes the height of the cruise in feet, so that some samples have a prediction by chance
+    feet = place.assign(tower="LW1", height_m=place["height_m"] / 0.3048)
+    above = place.assign(tower="LW1", height_m=place["height_m"] + 12.0)
+    emulated = table[table["channel"] == "USRP1"].rename(columns={"up_m": "height_m"})
+    floored = emulated[["east_m", "north_m", "height_m", "tower"]].assign(
+        level_db=np.maximum(0.5 * emulated["simulated_dbm"] - 10.0, -45.0)
+    )
+    files = {
+        "noisy.csv": noisy, "half.csv": half, "feet.csv": pd.concat([feet, feet.assign(tower="LW9")]),
+        "above.csv": above, "floored.csv": floored.drop_duplicates(["east_m", "north_m", "height_m", "tower"]),
+    }  # fmt: skip
+    for name, frame in files.items():
+        frame.to_csv(flight / name, index=False)
+    words = ["--link", "USRP2", "--step", "0.5", "-q"]
+    assert main(["channel", str(flight / "s" / "flight.yaml"), "-o", str(flight / "h"), *words]) == 0
+    # the twin is the sample flown again by the simulator: its noise differs, its offsets and floors do not
+    plan = flight / "s" / "twin.yaml"
+    plan.write_text((flight / "s" / "all.yaml").read_text().replace("seed: 7", "seed: 8"))
+    assert main(["simulate", str(plan), "-o", str(flight / "twin"), "-q"]) == 0
+    made = scored(flight, *map(flight.joinpath, files), flight / "h" / "channel.nc", flight / "twin")
+    return {card["prediction"]: card for card in made}
+
+
 def test_a_copy_of_our_levels_in_three_formats_scores_as_ours_do(flight: Path) -> None:
     table = ours(flight)
     by_time = table[["time_utc", "tower", "channel"]].assign(level_dbm=table["simulated_dbm"])
@@ -94,34 +142,20 @@ def test_a_copy_of_our_levels_in_three_formats_scores_as_ours_do(flight: Path) -
     assert cards[0]["fitted_on_this_flight"] == ["the offset of each model and channel"]
 
 
-def test_noise_is_significantly_worse_and_its_band_covers(flight: Path) -> None:
-    table = ours(flight)
-    rng = np.random.default_rng(5)
-    frame = table[["time_utc", "tower", "channel"]].assign(
-        level_db=table["measured_db"] + rng.normal(0.0, 8.0, len(table)), sd_db=8.0
-    )
-    frame.to_csv(flight / "noisy.csv", index=False)
-    (card,) = scored(flight, flight / "noisy.csv")
-    entry = card["levels"]["LW1"]["USRP1"]
+def test_noise_is_significantly_worse_and_its_band_covers(cards: dict[str, dict]) -> None:
+    entry = cards["noisy.csv"]["levels"]["LW1"]["USRP1"]
     score = entry["cards"]["noisy.csv"]
     assert score["rmse_db"] == pytest.approx(8.0, abs=0.8)
     assert score["coverage_90"] == pytest.approx(0.9, abs=0.04)
     assert score["crps_db"] == pytest.approx(8.0 / np.sqrt(np.pi), rel=0.12)
     assert entry["differences"]["ray tracing (this report)"]["verdict"] == "worse"
-    assert "significantly worse" in card["sentence"]
+    assert "significantly worse" in cards["noisy.csv"]["sentence"]
 
 
-def test_half_a_route_is_counted_as_unmatched(flight: Path) -> None:
-    table = ours(flight)
-    first = table.query("tower == 'LW1' and channel == 'USRP1'")
-    half = first.iloc[: len(first) // 2]
-    half[["time_utc", "tower"]].assign(level_dbm=half["simulated_dbm"]).drop_duplicates("time_utc").to_csv(
-        flight / "half.csv", index=False
-    )
-    (card,) = scored(flight, flight / "half.csv")
-    entry = card["levels"]["LW1"]["USRP1"]
+def test_half_a_route_is_counted_as_unmatched(cards: dict[str, dict]) -> None:
+    entry = cards["half.csv"]["levels"]["LW1"]["USRP1"]
     assert entry["unmatched"] > 0.2 * entry["matched"]
-    assert "at other times have none" in card["sentence"]
+    assert "at other times have none" in cards["half.csv"]["sentence"]
 
 
 def test_files_in_the_manner_of_three_programs_are_scored(flight: Path) -> None:
@@ -150,34 +184,23 @@ def test_files_in_the_manner_of_three_programs_are_scored(flight: Path) -> None:
     assert "Share of samples at or above a threshold" in page
 
 
-def test_heights_in_feet_and_unknown_towers_are_named_beside_the_score(flight: Path) -> None:
-    """A climb passes the height of the cruise in feet, so that some samples have a prediction by chance."""
-    table = ours(flight).query("channel == 'USRP1' and tower == 'LW1'").dropna(subset=["east_m", "simulated_dbm"])
-    place = table[["east_m", "north_m"]].assign(height_m=table["up_m"], level_dbm=table["simulated_dbm"])
-    place = place.drop_duplicates(["east_m", "north_m", "height_m"])
-    in_feet = place.assign(tower="LW1", height_m=place["height_m"] / 0.3048)
-    pd.concat([in_feet, in_feet.assign(tower="LW9")]).to_csv(flight / "feet.csv", index=False)
-    above = place.assign(tower="LW1", height_m=place["height_m"] + 12.0)
-    above.to_csv(flight / "above.csv", index=False)
-    feet, above = scored(flight, flight / "feet.csv", flight / "above.csv")
-    assert feet["remarks"][1:] == [
+def test_heights_in_feet_and_unknown_towers_are_named_beside_the_score(cards: dict[str, dict]) -> None:
+    assert cards["feet.csv"]["remarks"][1:] == [
         "feet.csv: the flight has no log of LW9; not scored.",
         "feet.csv: most samples have no prediction. Likely cause: heights in feet.",
     ]
-    _, remark = above["remarks"]
+    _, remark = cards["above.csv"]["remarks"]
     assert "another height datum: the predicted positions are 12 m above the flight" in remark
 
 
-def test_the_channel_of_the_flight_scores_as_the_replay_with_its_transmit_power(flight: Path) -> None:
+def test_the_channel_of_the_flight_scores_as_the_replay_with_its_transmit_power(cards: dict[str, dict]) -> None:
     """Learned antennas of the site are not part of the channel: their level_db has another unit for each tower."""
-    words = ["--link", "USRP2", "--step", "0.5", "-q"]
-    assert main(["channel", str(flight / "s" / "flight.yaml"), "-o", str(flight / "h"), *words]) == 0
-    (card,) = scored(flight, flight / "h" / "channel.nc")
+    card = cards["channel.nc"]
     assert card["remarks"][0] == "The levels of channel.nc are those of H, with 40 dBm transmitted."
-    cards = card["levels"]["LW3"]["USRP2"]["cards"]
-    replayed = cards["ray tracing (this report)"]
+    scores = card["levels"]["LW3"]["USRP2"]["cards"]
+    replayed = scores["ray tracing (this report)"]
     for key in ("offset_db", "rmse_offset_db"):
-        assert cards["channel.nc"][key] == pytest.approx(replayed[key], abs=0.15)
+        assert scores["channel.nc"][key] == pytest.approx(replayed[key], abs=0.15)
 
 
 def test_a_prediction_of_two_ranks_has_no_others(flight: Path) -> None:
@@ -194,16 +217,10 @@ def test_a_prediction_of_two_ranks_has_no_others(flight: Path) -> None:
     ]
 
 
-def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
-    table = ours(flight)
-    emulated = table[table["channel"] == "USRP1"].copy()
-    level = np.maximum(0.5 * emulated["simulated_dbm"] - 10.0, -45.0)
-    frame = emulated[["east_m", "north_m", "up_m", "tower"]].rename(columns={"up_m": "height_m"}).assign(level_db=level)
-    frame.drop_duplicates(["east_m", "north_m", "height_m", "tower"]).to_csv(flight / "twin.csv", index=False)
-    (card,) = scored(flight, flight / "twin.csv")
-    entry = card["levels"]["LW3"]["USRP1"]
-    assert entry["floor_db"] == -45.0
-    assert card["levels"]["LW1"]["USRP1"]["cards"]["twin.csv"]["slope"] > 1.5
+def test_levels_of_a_twin_have_offset_slope_and_floor(cards: dict[str, dict]) -> None:
+    levels = cards["floored.csv"]["levels"]
+    assert levels["LW3"]["USRP1"]["floor_db"] == -45.0
+    assert levels["LW1"]["USRP1"]["cards"]["floored.csv"]["slope"] > 1.5
 
 
 @pytest.mark.parametrize(
@@ -247,39 +264,41 @@ def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_prediction_that_cannot_be_scored_is_one_message(
-    change, words: str, flight: Path, capsys: pytest.CaptureFixture[str]
+    change, words: str, flight: Path, data: FlightData, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = ours(flight).query("channel == 'USRP1' and tower == 'LW1'").dropna(subset=["east_m", "simulated_dbm"])
     place = table[["east_m", "north_m"]].assign(height_m=table["up_m"])
     frame = table[["time_utc", "tower"]].assign(level_dbm=table["simulated_dbm"])
     change(frame, *([place] if change.__code__.co_argcount > 1 else [])).to_csv(flight / "bad.csv", index=False)
-    said = refused(flight, flight / "bad.csv", capsys)
-    assert words in said
-    assert "Next: correct bad.csv (docs/referee.md lists the columns) and run the same command" in said
+    # times and heights are compared with those of the scored samples
+    late = words.startswith("another")
+    assert words in (refused(flight, flight / "bad.csv", capsys) if late else unread(flight / "bad.csv", data))
 
 
-def test_damaged_files_are_one_message(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_files_are_one_message(flight: Path, data: FlightData, capsys: pytest.CaptureFixture[str]) -> None:
     for name, content in (
         ("empty.csv", b""), ("cut.nc", b"\x89HDF\r\n\x1a\n" + b"\0" * 60), ("old.nc", b"CDF\x01" + b"\0" * 60),
         ("zip.npz", b"PK\x03\x04" + b"\0" * 30), ("words.csv", b"\xff\xfe\0\0"),
     ):  # fmt: skip
         (flight / name).write_bytes(content)
-        assert name in refused(flight, flight / name, capsys)
-    assert "gone.csv" in refused(flight, flight / "gone.csv", capsys)
+        assert name in unread(flight / name, data)
+    said = refused(flight, flight / "empty.csv", capsys)
+    assert "Next: correct empty.csv (docs/referee.md lists the columns) and run the same command" in said
+    assert "gone.csv" in unread(flight / "gone.csv", data)
     (flight / "empty").mkdir()
-    assert "the folder contains no log that a reader recognises" in refused(flight, flight / "empty", capsys)
+    assert "the folder contains no log that a reader recognises" in unread(flight / "empty", data)
     centre = np.zeros((2, 2, 3))
     np.savez(flight / "db.npz", path_gain=np.full((1, 2, 2), -90.0), cell_centers=centre, tx_names=np.array(["LW1"]))
-    assert "a path_gain below 0; expected a linear gain, 0 or more" in refused(flight, flight / "db.npz", capsys)
+    assert "a path_gain below 0; expected a linear gain, 0 or more" in unread(flight / "db.npz", data)
     with zipfile.ZipFile(flight / "sheet.xlsx", "w") as book:
         book.writestr("xl/workbook.xml", "<workbook/>")
-    assert "an Excel workbook; save the sheet as CSV" in refused(flight, flight / "sheet.xlsx", capsys)
+    assert "an Excel workbook; save the sheet as CSV" in unread(flight / "sheet.xlsx", data)
     xarray.Dataset({"rss": ("time", np.zeros(3)), "tower": "LW1"}).to_netcdf(flight / "rss.nc")
-    assert "(columns: time, rss, tower)" in refused(flight, flight / "rss.nc", capsys)
+    assert "(columns: time, rss, tower)" in unread(flight / "rss.nc", data)
 
 
 def test_a_prediction_with_too_many_rows_is_refused_in_every_format(
-    flight: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    flight: Path, data: FlightData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Short rows of 250 MB took 3.4 GB of memory: a limit of the bytes alone bounds nothing."""
     monkeypatch.setattr(referee, "_MOST_ROWS", 30)
@@ -292,18 +311,13 @@ def test_a_prediction_with_too_many_rows_is_refused_in_every_format(
         flight / "many.nc"
     )
     for name in ("many.csv", "many.npz", "many.nc"):
-        assert "more than 30 rows" in refused(flight, flight / name, capsys)
+        assert "more than 30 rows" in unread(flight / name, data)
 
 
-def test_the_logs_of_an_emulated_flight_are_a_prediction(flight: Path) -> None:
-    """The twin is the sample flown again by the simulator: its noise differs, its offsets and floors do not."""
-    twin, plan = flight / "twin", flight / "s" / "twin.yaml"
-    plan.write_text((flight / "s" / "all.yaml").read_text().replace("seed: 7", "seed: 8"))
-    assert main(["simulate", str(plan), "-o", str(twin), "-q"]) == 0
-    (card,) = scored(flight, twin)
-    entry = card["levels"]["LW1"]["USRP1"]
-    assert entry["cards"]["twin"]["slope"] == pytest.approx(1.0, abs=0.15)
-    assert entry["cards"]["twin"]["n"] > 300
+def test_the_logs_of_an_emulated_flight_are_a_prediction(cards: dict[str, dict]) -> None:
+    score = cards["twin"]["levels"]["LW1"]["USRP1"]["cards"]["twin"]
+    assert score["slope"] == pytest.approx(1.0, abs=0.15)
+    assert score["n"] > 300
 
 
 def test_the_folder_of_the_flight_itself_is_no_prediction(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -202,7 +202,7 @@ def _share_seen(antenna: AntennaMap) -> float:
     near = np.zeros(grid.shape[:2], bool)
     for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
         near |= (grid @ part.T > np.cos(np.radians(10.0))).any(axis=-1)
-    weight = np.hypot(grid[..., 0], grid[..., 1])  # the area of a cell, which is zero at a pole
+    weight = np.hypot(grid[..., 0], grid[..., 1])  # proportional to the area of a cell, which is zero at a pole
     return float((near * weight).sum() / weight.sum())
 
 
@@ -223,7 +223,7 @@ def _groups(data: CalibrationData) -> Iterator[Places]:
 
 
 def scores_card(data: CalibrationData) -> Card:
-    """Return the card of held-out errors, by what was held out and by flight and channel."""
+    """Return the card of held-out errors, by the kind of held-out data and by flight and channel."""
     each = {"as logged": 1, "4 s means": 1}
     baselines = dict.fromkeys(BASELINES.values(), 1)
     rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
@@ -246,13 +246,13 @@ def scores_card(data: CalibrationData) -> Card:
 
 
 def _rows(splits: Mapping[str, Sequence[Mapping[str, Any]]] | None, keys: Sequence[str]) -> list[tuple[Any, ...]]:
-    """Return one row per score: what was held out, then the numbers of ``keys``."""
+    """Return one row per score: the kind of held-out data, followed by the numbers of ``keys``."""
     known = (splits or {}).items()
     return [(SPLIT_TITLE.get(split, split), *(row[key] for key in keys)) for split, of in known for row in of]
 
 
 def mounts_card(data: CalibrationData) -> Card:
-    """Return the card of the mounts of antennas with a measured pattern."""
+    """Return the card of the azimuths at which antennas with a measured pattern are mounted."""
     table = Table(
         caption="Mounts of antennas with a measured pattern; azimuth counter-clockwise from east (tower) or from the "
         "nose (UAV).",

@@ -38,9 +38,9 @@ class RssRow:
     flights with the same setting, tower and channel, and ``held_out_rmse_db`` is the RMSE with that offset. Both are
     NaN if there is no other flight.
 
-    ``baselines`` contains the RMSE of each baseline with its own offset, by name [dB]. ``span_db`` is the search range
-    of the offset. Arrays (n,) have one value per sample, NaN if measurement or simulation is missing. Only rows of the
-    first setting have these arrays; other rows have ``difference`` instead.
+    ``baselines`` contains the RMSE of each baseline by name [dB], after an offset is fitted to each. ``span_db`` is the
+    search range of the offset. Arrays (n,) have one value per sample, NaN if measurement or simulation is missing. Only
+    rows of the first setting have these arrays; other rows have ``difference`` instead.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class RssRow:
 
     @property
     def error_db(self) -> float:
-        """The error by which flights and settings are ordered [dB]: held out, or ``rmse_db`` without other flights."""
+        """The error by which flights and settings are sorted [dB]: held out, or ``rmse_db`` without other flights."""
         return self.held_out_rmse_db if np.isfinite(self.held_out_rmse_db) else self.rmse_db
 
     @property
@@ -209,12 +209,12 @@ class CampaignSummary:
     started : mapping of str to str
         First time of each flight (UTC, ISO 8601); missing for logs with relative times.
     ranking : tuple of SettingRank
-        Settings over all towers and channels, the best first.
+        Settings over all towers and channels, sorted by mean error.
     nodes : tuple of NodeOffset
         Offsets of nodes under the first setting, or from soundings between towers.
     places_db : mapping of (int, int) to float
-        Mean residual of the first setting over flights, towers and channels, by column and row of a horizontal cell,
-        counted from the origin of the site.
+        Mean residual of the first setting over flights, towers and channels [dB]. The keys are column and row of a
+        horizontal cell, counted from the origin of the site.
     reports : mapping of str to str
         Path of the report of each flight, relative to the folder of the campaign.
     """
@@ -269,7 +269,7 @@ class CampaignData(Made):
         return [row for row in self.reference_rows if np.isfinite(row.rmse_db) and row.n]
 
 
-# Largest number of warnings of flights that are listed one by one.
+# Largest number of flights whose warnings are listed one by one.
 FEW = 8
 
 # Sentence and next step, by the cause of :func:`~aerpaw_cmp.compare.verdict.campaign_verdict`.
@@ -384,7 +384,7 @@ def warnings(data: CampaignData) -> list[str]:
 
 
 def edge_warnings(data: CampaignData) -> list[str]:
-    """Return one warning per row whose best offset is at the end of its search range. This counts as a failed check."""
+    """Return one warning per row whose best offset is at the end of its search range. Each counts as a failed check."""
     return [
         f"{row.flight}, {row.setting}, {row.link}: the best offset is at the end of its search range."
         for row in data.rss
@@ -393,7 +393,7 @@ def edge_warnings(data: CampaignData) -> list[str]:
 
 
 def by_error(rows: Iterable[RssRow]) -> list[tuple[str, float, str]]:
-    """Return flights by error (:attr:`RssRow.error_db`), largest first: name, mean over links [dB], worst link."""
+    """Return name, mean :attr:`RssRow.error_db` over links [dB] and worst link of each flight, largest error first."""
     by = lists_by_key((row.flight, (row.error_db, row.link)) for row in rows if np.isfinite(row.error_db))
     flights = [(name, float(np.mean([e for e, _ in of])), max(of)[1]) for name, of in by.items()]
     return sorted(flights, key=lambda entry: -entry[1])
@@ -585,7 +585,7 @@ def _ranking(data: CampaignData) -> Table:
 
 
 def _flights(data: CampaignData) -> Table:
-    """Return the flights by their error under the best setting, with their errors under the next settings."""
+    """Return the flights, sorted by their error under the best setting, with their errors under the next settings."""
     season, link = data.season, Markup('<a href="{}">{}</a>')
     settings = [r.setting for r in season.ranking[:_FEW_SETTINGS]]
     by = {name: by_error(row for row in data.rss if row.setting == name) for name in settings}
@@ -754,9 +754,9 @@ def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
 
 
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
-    """Write ``campaign.html``, ``campaign.json`` and the tables. Return the files, the page first.
+    """Write ``campaign.html``, ``campaign.json`` and the tables. Return their paths, beginning with the page.
 
-    ``pairs.csv`` contains the pairs of flights at the same positions, which campaign.json does not have.
+    ``pairs.csv`` lists the pairs of flights at the same positions. They are not in campaign.json.
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None

@@ -1,7 +1,7 @@
 """Matplotlib figures of a report, drawn from finished arrays.
 
 Every figure is a separate :class:`matplotlib.figure.Figure`, drawn inside :func:`style` without pyplot and global
-state. Data sets differ not only in colour, but also in lightness, line style, marker or hatch, so that they can be
+state. Data sets differ in lightness, line style, marker or hatch as well as in colour, and can therefore be
 distinguished in grey. Dots are rasterised. Long lines are thinned, but retain their extremes. The SVG of a long flight
 is therefore small.
 """
@@ -58,11 +58,11 @@ def style() -> Iterator[None]:
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 9.0,
-        "text.parse_math": False,  # the name of a waypoint may contain $
+        "text.parse_math": False,  # names of waypoints may contain $
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",
-        "axes.titley": 1.0,  # otherwise matplotlib measures every axis to place its title
+        "axes.titley": 1.0,  # without this, matplotlib measures every axis to place its title
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.axisbelow": True,
@@ -229,14 +229,14 @@ def draw_marks(ax: Axes, marks: Sequence[Mapping[str, Any]]) -> None:
         elif kind == "line":
             dash = item.get("dash", _LINES[number % len(_LINES)])
             x, y = thinned(x, item["y"])
-            # a point between two gaps is not part of a line, so it gets a dot
+            # a point between two gaps is not part of a line, so mark it with a dot
             gap = np.pad(np.isnan(y), 1, constant_values=True)
             alone = ~gap[1:-1] & gap[:-2] & gap[2:]
             look |= {"marker": "o", "markersize": 1.3, "markevery": alone} if alone.any() else {}
             ax.plot(x, y, linestyle=dash, linewidth=1.2, **look)
         elif kind == "dots":
             size, marker = item.get("size", 4.0 if len(x) <= 200 else 1.3), item.get("marker", "o")
-            # as a picture inside an SVG, because a day of samples would be a file of many megabytes
+            # draw a picture inside the SVG, because a day of samples as vectors would need many megabytes
             ax.plot(x, item["y"], linestyle="none", marker=marker, markersize=size, rasterized=True, **look)
         elif len(x):
             bars = ax.broken_barh(
@@ -264,7 +264,7 @@ def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def draw_credit(ax: Axes, site: Site) -> None:
-    """Write the source of the map in a corner, in several lines because panels may be narrow."""
+    """Write the source of the map in a corner, in several lines, because panels may be narrow."""
     if site.credit:
         ax.text(
             0.995, 0.005, textwrap.fill(site.credit, 20), transform=ax.transAxes, ha="right", va="bottom", fontsize=5,
@@ -295,7 +295,7 @@ def draw_areas(ax: Axes, site: Site, looks: Mapping[str, Mapping[str, Any]]) -> 
         "geofence": [fence.area for fence in site.geofences],
     }
     for label, look in looks.items():
-        # use one path for all rings of an area, so that holes are not filled
+        # use one path for all rings of an area, because separate paths would fill the holes
         outlines: list[Any] = [
             Outline.make_compound_path(*(Outline(np.asarray(ring.coords)[:, :2], closed=True) for ring in rings))
             for rings in ((area.exterior, *area.interiors) for area in areas[label])
@@ -362,7 +362,7 @@ def frame_around(ax: Axes, east: FloatArray, north: FloatArray, *, margin: float
     margin : float
         Share of the extent on each side.
     shape : float
-        Width over height of the plan.
+        Ratio of width to height of the plan.
     """
     from matplotlib.text import Annotation
 
@@ -378,7 +378,7 @@ def frame_around(ax: Axes, east: FloatArray, north: FloatArray, *, margin: float
     ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
     ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
     for name in (text for text in ax.texts if isinstance(text, Annotation)):
-        # names are right of and above their towers; move those that would cross the right or upper edge
+        # a name is to the right of its tower and above it; move names that would cross the right or upper edge
         if name.xy[0] > middle_east + width / 4:
             name.set(x=-6, ha="right")
         if name.xy[1] > middle_north + 0.4 * height:
@@ -390,7 +390,7 @@ def frame_around(ax: Axes, east: FloatArray, north: FloatArray, *, margin: float
 
 
 def plan_shape(east: FloatArray, north: FloatArray) -> float:
-    """Return width over height of the area of points, limited to 0.8 to 2."""
+    """Return the ratio of width to height of the area of points, limited to 0.8 to 2."""
     good = np.isfinite(east) & np.isfinite(north)
     if not good.any():
         return 1.0
@@ -410,7 +410,7 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
 
 
 def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> None:
-    """Draw a colour bar next to axes. It has arrows at ends that values exceed, and an SVG contains it as a picture.
+    """Draw a colour bar next to axes. An arrow marks each end that values exceed. An SVG contains the bar as a picture.
 
     Parameters
     ----------

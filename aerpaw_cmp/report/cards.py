@@ -17,8 +17,8 @@ from ..compare.statistics import Interval
 from .page import json_text, rendered, write_file
 from .texts import cut, flat, interval, number, percent, short
 
-# Forms of a column: text, head of a row, right-aligned text, percentage. The form of a column of numbers is its number
-# of decimals.
+# Forms of a column: text, heading of a row, right-aligned text, percentage. The form of a column of numbers is its
+# number of decimals.
 TEXT, HEAD, RIGHT, SHARE = "text", "head", "right", "share"
 
 # Scripts of a page, by the view that shows its positions.
@@ -59,7 +59,7 @@ def estimate(value: float | None, ends: Interval | None, form: str | int = 2, ma
     form : str or int
         Decimals, or :data:`SHARE` for a percentage.
     mark : str
-        HTML around the number, such as ``<b>{}</b>``.
+        HTML in which the number is inserted, such as ``<b>{}</b>``.
 
     Returns
     -------
@@ -94,7 +94,8 @@ class Table:
     ----------
     caption : str
     columns : mapping of str to str or int
-        Heads, each with the form of its cells: :data:`TEXT`, :data:`HEAD`, :data:`RIGHT`, :data:`SHARE` or decimals.
+        Column headings, each with the form of its cells: :data:`TEXT`, :data:`HEAD`, :data:`RIGHT`, :data:`SHARE` or
+        decimals.
     rows : sequence of sequences
         Values of the cells, in the form that :func:`cell` accepts.
     look : str
@@ -120,7 +121,7 @@ class Positions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Card:
-    """A part of a page: heading, paragraphs, tables, charts and positions in this order, followed by inner cards.
+    """A part of a page: heading, paragraphs, tables, charts and positions in this order, and then inner cards.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ class Card:
         Section whose charts (:class:`~aerpaw_cmp.report.charts.Chart`) this card shows.
     positions : Positions, optional
     id, link : str
-        Anchor of a section, and its name in the navigation.
+        Anchor of a section, and its label in the navigation.
     fold : bool
         True if the card is closed until a reader opens it.
     group : str
@@ -239,6 +240,6 @@ def write_page(folder: Path, name: str, page: Page, numbers: Mapping[str, Any]) 
     Returns
     -------
     list of Path
-        The page first.
+        The page is the first.
     """
     return [write_file(folder / f"{name}.html", page.html()), write_file(folder / "metrics.json", json_text(numbers))]

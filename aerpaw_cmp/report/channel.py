@@ -27,7 +27,8 @@ from ..propagation.replay import PathTable, Replay, frequency_responses, impulse
 _LINK, _PORTS = ("time", "tower"), ("rx", "tx")
 _PATH = ("path", *_LINK)
 _SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
-# Dimensions that grow while a file is written: with each part, and with the number of paths of a link.
+# Dimensions that grow while a file is written: ``time`` with each part, and ``path`` with the number of paths of a
+# link.
 _GROWS = ("time", "path")
 
 
@@ -63,7 +64,7 @@ class Along:
     remarks: tuple[str, ...] = ()
 
     def part(self, rows: slice) -> Along:
-        """Return the selected poses."""
+        """Return these poses."""
         arrays = {"time_s": self.time_s, "number": self.number, "towers_m": self.towers_m,
                   "velocity_mps": self.velocity_mps, "tower_mps": self.tower_mps}  # fmt: skip
         some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
@@ -116,11 +117,11 @@ class Channel:
 
     @property
     def warnings(self) -> list[str]:
-        """The sentences about limits of the numbers."""
+        """Warnings about the limits of the numbers."""
         return [*self.along.remarks, *self.replay.left_out]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
-        """Return values per path (paths, ...) as an array (paths per link, poses, towers, ...). None stays None."""
+        """Return values per path (paths, ...) as an array (paths per link, poses, towers, ...), and None for None."""
         return None if values is None else self.table.by_link(values, self.replay.ends, fill)
 
 
@@ -213,7 +214,7 @@ def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: st
     """Return dimensions, values, attributes and encoding of a variable."""
     about = {"long_name": meaning, **({"units": unit} if unit else {})}
     if np.iscomplexobj(values):
-        # compression level 1 is enough for the zeros, and phases cannot be compressed
+        # a higher compression level does not help: level 1 removes the zeros, and phases cannot be compressed
         return dimensions, values, about, {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
     missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
     of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
@@ -382,7 +383,7 @@ def chosen_formats(names: Iterable[str]) -> tuple[str, ...]:
     Raises
     ------
     UsageError
-        If a name is unknown, or netCDF4 is missing, so that this is reported before hours of replay.
+        If a name is unknown, or netCDF4 is missing. This is reported before a replay, which may take hours.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """Charts that the script of a page draws, and the confusion matrix of serving cells.
 
 A chart has marks (:func:`~aerpaw_cmp.report.canvas.mark`) over two axes. Dots may have whiskers from ``low`` to
-``high``. ``rows`` are names that replace the numbers of the ordinate. :func:`chart_figure` draws the same marks.
+``high``. ``rows`` are names that replace the numbers on the ordinate. :func:`chart_figure` draws the same marks.
 """
 
 from __future__ import annotations

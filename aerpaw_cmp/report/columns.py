@@ -133,7 +133,7 @@ RANK: tuple[Column, ...] = (
 
 
 def header(columns: Sequence[Column]) -> list[str]:
-    """Return the names of the columns that every file has."""
+    """Return the names of the columns that are in every file."""
     return [column.name for column in columns if not column.optional]
 
 
@@ -146,7 +146,7 @@ def described(columns: Sequence[Column]) -> list[tuple[str, str, str]]:
 
 
 def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Column], list[tuple[Any, dict[str, Any]]]]:
-    """Compute the columns of some series, not yet rounded. A series has NaN in columns that only other series have.
+    """Compute the columns of some series without rounding. A column that only other series have is NaN.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS)
     total = sum(len(p.time) for p in data.rss) + sum(len(p.time) for p in data.rank)
 
     def share(n: int) -> int:
-        # at least 200 samples, so that a short series keeps its shape next to a very long one
+        # at least 200 samples, so that a short series is still recognisable next to a very long series
         return n if total <= limit else max(200, limit * n // total)
 
     rss_settings = data.settings.get("rss") or {}
@@ -115,7 +115,7 @@ def _rss(
 
 
 def _beside(data: ReportData, panel: RssResult, start: np.datetime64) -> dict[str, Any]:
-    """Return the second channel of a tower and the segments in which both differ, as in the paper's Fig. 15."""
+    """Return the second channel of a tower and the segments in which the channels differ, as in the paper's Fig. 15."""
     for pair in data.pairs:
         if pair.tower == panel.tower and panel.channel in (pair.first, pair.second):
             ends = [seconds_since(np.array(instants(pair.time, span)), start).tolist() for span in pair.score.spans]

@@ -218,12 +218,12 @@ def _ranks(data: ReportData) -> Table:
     )  # fmt: skip
 
 
-# Words for the entries of ``fitted_on_scored``.
+# Names on the page for the entries of ``fitted_on_scored``.
 _FITTED = {"offset_db": "offset", "lag_s": "clock lag"}
 
 
 def channels_card(data: ReportData) -> Card:
-    """Return the card of the received levels, with a part for each channel and each pair of channels."""
+    """Return the card of the received levels, with an inner card for each channel and each pair of channels."""
     parts = [_channel(data, panel) for panel in data.rss]
     caption = f"Segments in which the two channels differ by more than {PART_DB:.0f} dB."
     for p in data.pairs:
@@ -582,9 +582,9 @@ def write_report(
     ----------
     data : ReportData
     folder : path
-        An empty folder, such as that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`.
+        An empty folder, such as the result of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`.
     drawn : str
-        One of :data:`~aerpaw_cmp.report.page.FIGURES`.
+        A value of :data:`~aerpaw_cmp.report.page.FIGURES`.
     kmz : bool
         Also write ``samples.kmz``.
     netcdf : bool
@@ -595,7 +595,7 @@ def write_report(
     Returns
     -------
     files : list of Path
-        ``report.html``, the CSV files (only a header if they have no rows), the figures, ``metrics.json``.
+        ``report.html``, the CSV files (with only a header if there are no rows), the figures, ``metrics.json``.
     data : ReportData
         The data with the seconds of all stages.
 

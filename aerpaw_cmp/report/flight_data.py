@@ -134,17 +134,17 @@ class ReportData(FlightResult):
     versions : mapping of str to str
     inputs : tuple of InputFile
     track, waypoints
-        The track of the UAV, and its named points.
+        The track of the UAV, and the named points of the flight.
     sources : mapping of str to Source
         Origin of the samples in the logs, by tower and channel.
     synthetic : bool
-        True if ``aerpaw-cmp simulate`` made the logs. The first screen then says so.
+        True if ``aerpaw-cmp simulate`` wrote the logs. The page then says so at the top.
     warnings : tuple of str
         Sentences about limits of the numbers.
     doubts : tuple of str
         Clauses about clocks and heights for the summary.
     cautions : tuple of str
-        Sentences about settings that do not fit the flight. They are shown before all warnings.
+        Sentences about settings that do not fit the flight, which are shown before all warnings.
     antennas : tuple of str
         Sentences that name the antennas of the replay.
     notes : tuple of str
@@ -217,7 +217,7 @@ def report_data(
     result : FlightResult
         Numbers of the flight.
     notes : sequence of str
-        Remarks in addition to those of the flight file.
+        Remarks in addition to the notes of the flight file.
     other_inputs : sequence of InputFile
         Files other than logs: settings, site, antennas.
     paths : sequence of PosePaths
@@ -366,7 +366,7 @@ def waypoints_of(data: FlightData) -> tuple[DrawnPoint, ...]:
         distance = np.linalg.norm(line_m[start:] - (point.east_m, point.north_m, point.height_m), axis=1)
         if not point.label or np.isnan(distance).all():
             continue
-        # use the first time that is within 2 m of the nearest approach, because later visits belong to later waypoints
+        # use the first time within 2 m of the smallest distance, because later visits belong to later waypoints
         near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
         index = start + int(near[0])
         out.append(DrawnPoint(label=point.label, time=track.time[index], east_m=point.east_m, north_m=point.north_m))

@@ -91,7 +91,7 @@ def trajectory(data: ReportData, track: DrawnTrack) -> Figure:
     flown = track.position_m[:, :2]
     extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
     places = (data.site.towers[name].position_m[None, :2] for name in used_towers(data))
-    # omit distant towers, because the flight would be a dot next to them
+    # omit distant towers, because the flight would shrink to a dot
     near = [place for place in places if np.linalg.norm(place - centre) < extent]
     canvas.frame_around(ax, *np.concatenate([flown, *near, *ways.values()]).T)
     for waypoint in data.waypoints:
@@ -149,7 +149,7 @@ def over_time(
         handles, labels = ax.get_legend_handles_labels()
         names = [textwrap.fill(label, 26) for label in labels]
         legend = ax.legend(handles, names, loc="center left", bbox_to_anchor=(1.0, 0.5))
-        for handle in legend.get_lines():  # the dots of the chart would be too small here
+        for handle in legend.get_lines():  # in a legend, dots of the chart's size are too small
             handle.set_markersize(5.0 if handle.get_linestyle() == "None" else 0.0)
     canvas.time_axis(grid[-1, 0], start)
     return fig
@@ -164,7 +164,7 @@ def _limits(marks: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
 
 
 def _spans(seconds: FloatArray, mask: BoolArray, name: str, **look: Any) -> dict[str, Any]:
-    """Return the mark of the segments of True samples at these times (n,)."""
+    """Return the mark of the segments in which the samples at these times (n,) are True."""
     # extend each segment by half a step on each side, so that a single sample is visible
     half = float(np.median(np.diff(seconds))) / 2 if len(seconds) > 1 else 0.5
     first, last = canvas.runs(mask)
@@ -175,13 +175,13 @@ def _spans(seconds: FloatArray, mask: BoolArray, name: str, **look: Any) -> dict
     return mark("spans", name, seconds[first] - half, ends=seconds[last] + half, **look)
 
 
-# Number of segments that a time axis can show. It exceeds the number of pixels.
+# Largest number of segments on a time axis. It exceeds the number of pixels.
 _MOST_SPANS = 2000
 NO_PATH, SHADE = "out of coverage: no path in the simulation", "#DDDDDD"
 
 
 def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
-    """Draw over time: the level as logged, simulation and baselines minus their offsets, and the residual."""
+    """Draw over time the logged level, simulation and baselines minus their offsets, and the residual."""
     seconds, score = canvas.seconds_since(panel.time, start_of(data)), panel.score
     simulated = _moved(panel.simulated_dbm, score.offset_db)
     silent = panel.measured_out_of_coverage
@@ -243,7 +243,7 @@ def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssR
 
 
 def rank_maps(data: ReportData, panel: RankResult) -> Figure:
-    """Draw the measured rank and the rank of every K along the flight. Each rank has a colour and a marker."""
+    """Draw the measured rank and the rank predicted for every K along the flight, with a colour and marker per rank."""
     maps = [("Measured (reported RI)", panel.measured)]
     maps += [(f"Ray tracing, K = {k_key(k)}", rank.astype(float)) for k, rank in panel.rank.items()]
     columns = 2 if len(maps) > 1 else 1

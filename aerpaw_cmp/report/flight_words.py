@@ -98,7 +98,7 @@ RANK_WORDS = (
 
 
 def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
-    """Return the sentence about the settings that are not significantly worse than the best one.
+    """Return the sentence about the settings that are not significantly worse than the best setting.
 
     ``verdicts`` has the verdict of the paired interval of each other setting. At most ``most`` settings are named.
     """
@@ -120,7 +120,8 @@ def first_sentence(
 ) -> str:
     """Return the sentence about the error of ray tracing and of one baseline in all flights of a campaign.
 
-    The baseline is the best one that is better than ray tracing, or otherwise the best one.
+    This is the best of the baselines that are significantly better than ray tracing on more channels than they are
+    worse. If there are none, it is the best of all baselines.
 
     Parameters
     ----------
@@ -198,8 +199,8 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
 
 
 def expected_sentence(panels: Sequence[RssResult]) -> str:
-    """Return the expected error on another flight of this kind, if all channels have errors of held-out flights."""
-    # for a receiver that can lose its lock, the error with its floor counts
+    """Return the expected error on another flight of this kind, if all channels have scores of held-out flights."""
+    # for a receiver that can lose its lock, use the error of all samples, including levels at its floor
     given = [panel.further.elsewhere or {} for panel in panels]
     known = [entry.get("floor_rmse_db", entry.get("rmse_db", math.nan)) for entry in given]
     error = math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
@@ -262,7 +263,7 @@ def audit_paths(audit: AuditResult) -> str:
     return ", ".join(parts)
 
 
-# Outliers that change an RMSE by more than this are named [dB].
+# Outliers are mentioned if they change an RMSE by more than this [dB].
 _MOVED_DB = 0.3
 
 
@@ -297,7 +298,7 @@ def models_verdict(models: Sequence[ModelRow]) -> str:
 
 
 def training_sentence(names: Sequence[str], what: str) -> str:
-    """Return the summary of a report on a training log, whose errors are not those of a prediction."""
+    """Return the summary of a report on a training log. Its errors are smaller than errors of a prediction."""
     of = _listed(list(names)) if len(names) < 3 else f"{len(names)} channels"
     were = "was" if what == "the receiver" else "were"
     return (
@@ -312,7 +313,7 @@ def _learned_from(digests: Sequence[str]) -> str:
 
 
 def rss_verdict(panel: RssResult) -> str:
-    """Return sentences about the error of one channel and of the baselines."""
+    """Return sentences about the error of one channel and the errors of the baselines on it."""
     if panel.training:
         return training_sentence([panel.name], "the antennas") + _learned_from(panel.further.trained_on or ())
     score = panel.score
@@ -359,7 +360,7 @@ def learned_on(score: DetectionScore) -> str:
 
 
 def _snr_words(panel: RssResult) -> str:
-    """Return the sentence about a signal-to-noise ratio, whose error is stated without a fitted offset."""
+    """Return the sentence about a measured signal-to-noise ratio. Its error is stated without a fitted offset."""
     snr = panel.further.snr
     if snr is None:
         return ""
@@ -533,7 +534,7 @@ def _level_sentence(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -
     return flight_sentence(pooled, next((lock.floor_db for p in panels if (lock := lock_lost(p))), None))
 
 
-# A sentence about causes after an RMSE below this would read like a failure.
+# Below this RMSE there is no sentence about causes, because it would read like a failure.
 _SMALL_ERROR_DB = 3.0
 
 
@@ -544,7 +545,7 @@ def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) ->
     if is_one_place(panels):
         return ONE_PLACE
     good = pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0)
-    if good or expected_sentence(panels):  # after a usual error, a sentence about causes would mislead
+    if good or expected_sentence(panels):  # with an expected error on the page, a sentence about causes would mislead
         return ""
     few = max(panel.score.n for panel in panels) < FEWEST_SAMPLES
     return FEW_SAMPLES.format(n=FEWEST_SAMPLES) if few else NO_CAUSE

@@ -1,7 +1,8 @@
 """The file samples.kmz of a report: the samples along the flight for Google Earth and QGIS.
 
-The tracks are coloured by level, residual and rank. There is one folder per link and quantity, and only the first is
-visible at first. Samples out of coverage are grey. Maps over a grid are written by :mod:`aerpaw_cmp.maps.export`.
+The tracks are coloured by level, residual and rank. There is one folder per link and quantity. When the file is opened,
+only the first folder is visible. Samples out of coverage are grey. Maps over a grid are written by
+:mod:`aerpaw_cmp.maps.export`.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def write_kmz(data: ReportData, folder: Path) -> Path:
 
 
 def coloured(data: ReportData) -> Iterator[Coloured]:
-    """Yield every link with each of its quantities. Levels share one scale, residuals another, and ranks have classes.
+    """Yield every link with each of its quantities. All levels share a colour scale, and all residuals share another.
 
     A rank of 0 means that there is no path.
     """
@@ -153,7 +154,7 @@ def _lines(item: Coloured, frame: SiteFrame, budget: int, *, clock: bool, visibl
     times, bins = iso_time(item.series.time[known]), item.scale.bin_of(values)
     starts = np.flatnonzero(np.concatenate([[True], bins[1:] != bins[:-1]]))
     for first, after in zip(starts, [*starts[1:], len(known) - 1], strict=True):
-        last = int(after)  # end a line where the next begins, so that there is no gap
+        last = int(after)  # end a line at the first point of the next line to avoid a gap
         if last <= first:
             continue
         number = int(bins[first])

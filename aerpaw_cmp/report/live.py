@@ -65,9 +65,9 @@ def live_page(background: dict[str, Any] | None, title: str) -> tuple[bytes, str
     Parameters
     ----------
     background : dict, optional
-        Result of :func:`live_map`. With None, the page shows only the measurement, without a map.
+        Result of :func:`live_map`. With None, the page has no map and shows only the measurement.
     title : str
-        Text next to the heading.
+        Text beside the heading.
     """
     style, code = script("live.css"), script("common.js", "live.js")
     shown = {"title": title, "mapped": background is not None, "scene": Markup(as_json(background or {}))}

@@ -20,12 +20,12 @@ from .texts import minute
 def write_locate(
     numbers: Mapping[str, Any], regions: Regions, track_m: FloatArray, site: Site, folder: Path
 ) -> list[Path]:
-    """Write the page and its files, and return their paths, the page first.
+    """Write the page and its files, and return their paths, beginning with the page.
 
     Parameters
     ----------
     numbers : mapping
-        Content of metrics.json. ``modes`` are the possible positions, the likeliest first.
+        Content of metrics.json. ``modes`` are the possible positions, sorted by probability.
     regions : Regions
     track_m : (n, 2 or more)
         East, north of the flight [m].

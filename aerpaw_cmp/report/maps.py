@@ -84,7 +84,7 @@ class MapError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperRow:
-    """A number of the paper, the same number from this run, and the figure that shows it."""
+    """A number of the paper, the same number from this run, and the figure of the paper that shows it."""
 
     where: str
     what: str
@@ -279,7 +279,7 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
     values : (rows, columns)
         Values of the cells from south to north; NaN out of coverage.
     highlight : str, optional
-        Name of the only tower that is drawn. Borders are then omitted.
+        Draw only the tower of this name, and no borders.
     options
         Options of :meth:`matplotlib.axes.Axes.imshow`.
 
@@ -348,7 +348,7 @@ def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
 
 
 def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
-    """Draw the maps of each tower and the joint map, for one choice of antennas and height, with limits [dBm]."""
+    """Draw the maps of each tower and the joint map for one height and one choice of antennas, with limits [dBm]."""
     fig, axes = map_axes(data, len(maps))
     image = None
     for ax, shown in zip(axes, maps, strict=True):
@@ -498,13 +498,13 @@ def plates(data: MapsData) -> Iterator[Plate]:
 def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
     """Return the ends of one colour scale for all maps: the 1 to 99.5 % range, rounded to 5 dB [dBm]."""
     levels = np.concatenate([np.zeros(0), *(entry.values.ravel() for entry in maps)])
-    # exclude the few cells next to a tower that are far above all others and would take most colours
+    # exclude the few cells next to a tower, because their high levels would use most of the colour scale
     low, high = ends_of_scale(levels[np.isfinite(levels)], 99.5)
     return 5.0 * math.floor(low / 5), 5.0 * max(math.ceil(high / 5), math.floor(low / 5) + 1)
 
 
 def figure_specs(data: MapsData) -> list[FigureSpec]:
-    """Return every figure that the data allow, in reading order."""
+    """Return every figure that the data allow, in the order of the page."""
     return [*_rss_specs(data), *_rank_specs(data), *(plate.spec for plate in plates(data))]
 
 
@@ -529,7 +529,8 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
         yield FigureSpec(f"rank_map_learned_{safe_name(tower)}", partial(rank_grid, data, learned))
 
 
-# Largest size of the layers as base64 [bytes]. Above it, first layers of single towers are omitted, then cells.
+# Largest size of the layers as base64 [bytes]. If it is exceeded, layers of single towers are omitted first, and then
+# cells.
 MOST_BYTES = 4_000_000
 
 _LATTICE = 9
@@ -804,7 +805,7 @@ def maps_page(data: MapsData, files: Sequence[str]) -> str:
 
 
 def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[Path]:
-    """Write ``map.html``, ``metrics.json`` and figures in the formats ``drawn``, and return the files, page first."""
+    """Write ``map.html``, ``metrics.json`` and figures in the formats ``drawn``. Return the paths, page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
     files = write_figures(partial(figure_specs, data), folder / "figures", drawn)

@@ -27,7 +27,7 @@ _TREES = 1500
 
 
 class PackedArrays:
-    """The arrays of a page in one block. Equal arrays are stored once, and each starts at a multiple of eight bytes.
+    """The arrays of a page in one block. Equal arrays are stored once. Each array starts at a multiple of eight bytes.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def step_for(values: FloatArray, finest: float) -> float:
     """
     array = np.asarray(values, dtype=np.float64)
     reach = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
-    # allow for rounding of the logarithm, because a value at the limit must not get a larger step
+    # allow for rounding of the logarithm, which would give a value at the limit a larger step
     tens = int(np.ceil(np.log10(max(reach / (LARGEST * finest), 1.0)) - 1e-12))
     return float(finest * 10.0**tens)
 
@@ -130,7 +130,7 @@ def at_height(line_m: FloatArray, up_m: float) -> FloatArray:
 def ends_of_scale(values: FloatArray, most: float) -> list[float]:
     """Return the ends of a colour scale: the 1 % and ``most`` % quantiles of finite values.
 
-    If all values are equal, the ends are half a unit below and above. Without values, they are 0 and 1.
+    If all values are equal, the ends are half a unit below and above. If there are no values, they are 0 and 1.
     """
     low, high = (float(v) for v in np.percentile(values, [1.0, most])) if len(values) else (0.0, 1.0)
     return [low, high] if high > low else [low - 0.5, low + 0.5]

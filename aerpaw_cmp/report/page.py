@@ -1,6 +1,6 @@
 """Basis of all pages: template engine, files of a folder of results, and figures.
 
-A page is one file that needs no other file and no network. The template engine escapes every text from a log or a
+A page is a single file that needs no network. The template engine escapes every text from a log or a
 configuration.
 """
 
@@ -34,7 +34,7 @@ def links_of(by_tower: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str],
 
 
 def merge(into: dict[str, Any], numbers: Mapping[str, Any]) -> None:
-    """Merge ``numbers`` into ``into``, key by key. Other keys of ``into`` are not changed."""
+    """Merge ``numbers`` into ``into``, key by key. Keys that ``numbers`` does not have are not changed."""
     for key, value in numbers.items():
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
             merge(into[key], value)
@@ -63,7 +63,7 @@ def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Made:
-    """The time (UTC, ISO 8601), versions and times per stage, which every page and its metrics.json contain."""
+    """The content that every page and its metrics.json share: time (UTC, ISO 8601), versions, and seconds per stage."""
 
     generated: str = field(default_factory=utc_now)
     versions: Mapping[str, str] = field(default_factory=versions)
@@ -86,7 +86,7 @@ _CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline';
 
 
 def digest(text: str) -> str:
-    """Return the digest of a script or style for a content security policy."""
+    """Return the SHA-256 of a script or style in the form of a content security policy."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
@@ -107,7 +107,7 @@ def environment() -> Any:
 
 
 def script(*names: str) -> str:
-    """Return the text of the named scripts, joined."""
+    """Return the joined text of the named scripts."""
     folder = resources.files("aerpaw_cmp.report") / "templates"
     return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
 
@@ -121,28 +121,28 @@ def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
 
 
 def as_json(content: Mapping[str, Any]) -> str:
-    """Return JSON text for a script element. It is escaped so that no text inside can end the element."""
+    """Return JSON text for a script element. Each ``<`` is escaped, so that no text inside can end the element."""
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def embedded(content: Mapping[str, Any] | None) -> Markup:
-    """Return the element with the data of a page's script, or nothing if there are no data."""
+    """Return the data of a page's script as JSON text, or an empty text if there are no data."""
     return Markup(as_json(content)) if content else Markup("")
 
 
 def write_figures(
     specs_of: Callable[[], Sequence[FigureSpec]], folder: Path, drawn: str, progress: Progress = logged
 ) -> list[Path]:
-    """Draw figures, write each in one or all formats, and return the files.
+    """Draw figures, write each in one or all formats, and return the paths.
 
     Parameters
     ----------
     specs_of : callable
-        Returns the figures.
+        Function that returns the figures.
     folder : Path
-        Created if it does not exist.
+        Folder, which is created if it does not exist.
     drawn : str
-        One of :data:`FIGURES`.
+        A value of :data:`FIGURES`.
     progress : Progress
         Called with the share of figures that have been drawn.
 

@@ -110,7 +110,7 @@ def payload(
 
 
 def _scale(group: str, layer: str) -> tuple[str, str]:
-    """Return the key of a colour scale. It is the same at all heights, and before and after a flight."""
+    """Return the key of a colour scale. All heights share one scale, and so do values before and after a flight."""
     return group.partition(", ")[0], layer.partition(" ")[0]
 
 
@@ -130,7 +130,7 @@ def _group(
     layers = []
     for name, column in group.values.items():
         values = np.asarray(column, dtype=np.float64)[pick]
-        # use finer steps for probabilities, in which steps of 0.01 would be visible
+        # use finer steps for probabilities, because steps of 0.01 would be visible
         step = step_for(values, 1e-4 if "probability" in name else 0.01)
         scale = {"range": ranges[_scale(group.name, name)], "step": step}
         layers.append({"name": name, **scale, "values": arrays.add_steps(values, step)})

@@ -26,8 +26,8 @@ class PlanPage(Made):
 
     ``candidates`` and ``curve`` are rows of metrics.json. ``outline_m`` (k, 2) and ``holes_m`` limit the area in which
     a route may run [m]. ``track_m`` (n, 3) is the recommended route. ``place_m`` (m, 3) are the points of the target,
-    and ``before_db`` and ``after_db`` (m,) their standard deviations. If the target is all directions, the points are
-    directions from ``seen_from_m`` (3,).
+    and ``before_db`` and ``after_db`` (m,) the standard deviations at them [dB]. If the target is all directions, the
+    points are directions from ``seen_from_m`` (3,).
     """
 
     target: str
@@ -97,7 +97,7 @@ def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
 
 
 def write_plan(data: PlanPage, folder: Path) -> list[Path]:
-    """Write the page and its files, and return their paths, the page first."""
+    """Write the page and its files, and return their paths, beginning with the page."""
     shown = payload(
         list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m],
         note="Solid line: the recommended route. Dashed lines: limits of the area in which it may run.",
@@ -111,7 +111,7 @@ def write_plan(data: PlanPage, folder: Path) -> list[Path]:
 
 
 def _groups(data: PlanPage) -> Iterator[Places]:
-    """Yield the proposed route, which is shown first, and the target: positions, or directions from a tower.
+    """Yield the proposed route, and then the target, which consists of positions or of directions from a tower.
 
     The values of each point of the target are averaged over all headings.
     """

@@ -39,7 +39,7 @@ TITLES = {
     "prior": "ray tracing with isotropic antennas, before any flight",
 }
 
-# Flags of points. Outside the flown area, the standard deviation is that of the model without flights nearby.
+# Flags of points. Outside the flown area, no samples nearby reduce the standard deviation.
 FLAGS = ("outside_flown", "out_of_coverage", "no_position")
 
 # Share of points outside the flown area above which the summary names it.
@@ -131,7 +131,7 @@ def first_words(
     heading : str
         Text of :func:`heading_words`.
     lock : float, optional
-        Mean probability of lock, for a receiver that loses it.
+        Mean probability of lock, for a receiver that can lose its lock.
     origin : str
         Sentence about the source of the prediction, if there is no correction.
 
@@ -165,7 +165,7 @@ def cautions(correction: Correction, outside: float) -> list[str]:
 
 
 def notes(correction: Correction) -> list[str]:
-    """Return sentences about intervals on held-out data that hold, about the model, and about the residual field."""
+    """Return sentences about the model, about the residual field, and about intervals if held-out data confirm them."""
     stated, holds = _stated(correction)
     texts = [stated if holds else "", f"Model: {TITLES[correction.base]}.", said_of(field(correction), FIELD)]
     return [text for text in texts if text]
@@ -197,7 +197,7 @@ def prior_cautions(sd_db: Mapping[str, float], beyond: float) -> list[str]:
 
 
 def _stated(correction: Correction) -> tuple[str, bool]:
-    """Return sentence and next step about the stated standard deviations on held-out data, and whether they hold."""
+    """Return sentence and next step about the stated standard deviations, and whether held-out data confirm them."""
     error, sd = correction.held_out[correction.base, correction.title]
     verdict = stated_errors(error, sd, place_m=correction.held_out_place_m)
     known = np.isfinite(error)
@@ -212,7 +212,7 @@ def _against_free_space(correction: Correction) -> Verdict:
         correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))
     )
     if len(correction.flights) > 1:
-        # as in calibrate, compare per flight, because samples of one flight share offset and weather
+        # compare per flight as in calibrate, because samples of one flight share offset and weather
         parts = correction.held_out_parts
         verdict = by_flight(_by_part(error, parts), _by_part(free_space, parts))
         return replace(verdict, cause="two flights") if verdict.cause == "no interval" else verdict
@@ -369,7 +369,7 @@ _ROWS_AT_ONCE = 100_000
 
 
 def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
-    """Write the page and its files, and return them with reasons why a file could not be written.
+    """Write the page and its files. Return their paths, and the reasons why a file could not be written.
 
     Parameters
     ----------
@@ -379,9 +379,9 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     Returns
     -------
     files : list of Path
-        The page first.
+        The page is the first.
     said : list of str
-        Reasons.
+        Why prediction.nc was not written; empty if it was.
     """
     numbers = prediction_metrics(data)
     flown = [np.asarray(line).T for line in data.flown.values()]
@@ -421,7 +421,7 @@ def _dataset(data: PredictionPage) -> Dataset:
     ends = ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db")
     for name in (*ends, "p_serving", "p_lock", "locked_db", "locked_sd_db", "lost_db", "lost_sd_db"):
         if name in first:
-            # NaN for a channel that a tower does not have
+            # the values of a channel that a tower does not have remain NaN
             values = np.full((*map(len, labels.values()), len(axis)), np.nan, dtype=np.float32)
             for place, part in zip(at, series, strict=True):
                 values[place] = part[name]

@@ -1,7 +1,7 @@
 """The files rss.nc and rank.nc of a report: the samples of rss.csv and rank.csv with units and the names of links.
 
-Dimensions are the names of :data:`_AXES` and ``obs``, the number of a sample in its series. Series that are shorter
-than the longest one end with NaN. Variables are those of :mod:`.columns`, and a missing number is NaN.
+Dimensions are the names of :data:`_AXES` and ``obs``, the number of a sample in its series. Shorter series are filled
+with NaN up to the length of the longest. Variables are those of :mod:`.columns`, and a missing number is NaN.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _numbers(values: Any) -> FloatArray:
 
 
 def _degrees(data: ReportData, samples: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return latitude and longitude (n,) of the samples [deg] to 1 mm, NaN for unknown positions."""
+    """Return latitude and longitude (n,) of the samples [deg], rounded to 1 mm; NaN for unknown positions."""
     east, north = samples["east_m"], samples["north_m"]
     known = np.isfinite(east) & np.isfinite(north)
     latitude, longitude = data.site.frame.to_geographic(np.where(known, east, 0.0), np.where(known, north, 0.0))
@@ -108,7 +108,7 @@ def _seconds(time: AnyArray) -> tuple[FloatArray, dict[str, str]]:
 
 
 def _attributes(column: Column) -> dict[str, Any]:
-    """Return the attributes of a quantity. UDUNITS has no dB, so that its definition is written."""
+    """Return the attributes of a quantity. UDUNITS has no dB, so its definition is written instead."""
     shared: dict[str, Any] = {"long_name": column.meaning}
     if column.name.startswith(("measured_rank", "simulated_rank")):
         shared |= {"flag_values": _RANKS["flag_values"].astype(np.float64), "flag_meanings": _RANKS["flag_meanings"]}

@@ -1,6 +1,6 @@
 """Drawings of a site: a plan, and a page that shows it in 3-D.
 
-The page is one file that contains its script and loads no other file.
+The page contains its script and loads no other file.
 """
 
 from __future__ import annotations
@@ -79,12 +79,12 @@ def write_site_view(site: Site, folder: str | Path) -> list[Path]:
     ----------
     site : Site
     folder : path
-        Created if it does not exist.
+        Folder, which is created if it does not exist.
 
     Returns
     -------
     list of Path
-        The page first.
+        The page is the first.
     """
     folder, stem = Path(folder), safe_name(site.name)
     written = [write_file(folder / f"{stem}.html", viewer(site))]

@@ -98,7 +98,7 @@ def duration(seconds: float | None) -> str:
 
 
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Yield nested settings as dotted names and plain text. Settings without a value are omitted.
+    """Yield nested settings as dotted names and plain text. Keys without a value are omitted.
 
     An interval without an upper end becomes ``≥ low``. The records of a list, such as the logs of a flight, are
     numbered.

@@ -1,7 +1,7 @@
 """Far fields of antenna elements: formulas and measured files.
 
-Every pattern has a ``name`` and ``field(theta_rad, phi_rad) -> (E_theta, E_phi)``. The result is complex, has the
-broadcast shape and is scaled so that ``|E_theta|^2 + |E_phi|^2`` is the gain over isotropic (linear). theta is the
+Every pattern has a ``name`` and ``field(theta_rad, phi_rad) -> (E_theta, E_phi)``. The results are complex and have the
+broadcast shape of the angles. ``|E_theta|^2 + |E_phi|^2`` is the linear gain over an isotropic antenna. theta is the
 zenith angle (0 to pi) and phi the azimuth from x towards y in the device frame: x boresight, y left, z up.
 
 Measured fields are interpolated on a torus: a full circle of theta (through both poles) times a full circle of phi.
@@ -39,14 +39,14 @@ from ..logs.matfile import read_arrays
 # Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi).
 _HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 
-# Smallest plausible mean gain (-20 dB). A lower value means other units or normalised fields. Measured antennas have
-# about 0.5.
+# Smallest plausible mean gain (-20 dB). A lower value means that the file has other units or normalised fields.
+# Measured antennas have about 0.5.
 _MINIMUM_EFFICIENCY = 0.01
 
-# Likely cause of a mean gain that no antenna has, unless the values are linear.
+# Likely cause of a mean gain that no antenna can have. If the values look linear, another cause is reported.
 NOT_GAIN = "the values are not gain over isotropic"
 
-# No element has a higher gain. A file with a higher gain has other units.
+# Largest plausible gain. A file with a higher gain is not in dBi.
 HIGHEST_DBI = 60.0
 
 
@@ -93,7 +93,7 @@ class TR38901:
     name: str = "tr38901"
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return the complete field in E_theta, because the slant belongs to the array."""
+        """Return the complete field as E_theta, because the slant is a property of the array."""
         zeros = _zeros(theta_rad, phi_rad)
         theta_deg = np.degrees(np.asarray(theta_rad, dtype=np.float64))
         phi_deg = wrap_degrees(np.degrees(phi_rad))
@@ -111,8 +111,8 @@ class MeasuredPattern:
     name : str
         Name for reports.
     e_theta, e_phi : (thetas, phis) complex
-        Samples at theta = 0 to pi and phi = 0 to below 2 pi, both equally spaced, with both ends of theta and an even
-        number of phis. The scale is the square root of gain. If ``e_phi`` is None, the pattern is a gain grid without
+        Samples at equally spaced theta from 0 to pi (both included) and phi from 0 to below 2 pi. The number of phis is
+        even. An amplitude is the square root of a gain. If ``e_phi`` is None, the pattern is a gain grid without
         polarisation, whose amplitude is in E_theta.
     frequency_hz : float or None
         Frequency of the measurement.
@@ -124,7 +124,7 @@ class MeasuredPattern:
     efficiency : float
         Mean gain over the sphere (radiation efficiency times mismatch).
     trained_on, marks : tuple of str
-        SHA-256 and fingerprints of the logs that it was learned from, on which it must not be scored.
+        SHA-256 and fingerprints of the training logs, on which the pattern must not be scored.
     """
 
     trained_on: tuple[str, ...] = ()
@@ -145,13 +145,13 @@ class MeasuredPattern:
         self.efficiency = _sphere_mean(samples)
         if e_phi is None:
             amplitude = np.abs(e_theta)
-            for row in (0, -1):  # a pole is one direction, so its row has one value
+            for row in (0, -1):  # a pole is a single direction, so all samples of its row get the same value
                 amplitude[row] = np.sqrt((amplitude[row] ** 2).mean())
             # an amplitude without polarisation has no direction to rotate
             self._layers = [_spline(_torus(amplitude, +1).real)]
         else:
             theta_part, phi_part = _single_valued_poles(e_theta, e_phi)
-            # beyond a pole both unit vectors are inverted
+            # beyond a pole, both unit vectors have the opposite sign
             torus = [_torus(theta_part, -1), _torus(phi_part, -1)]
             self._layers = [_spline(layer) for part in torus for layer in (part.real, part.imag)]
 
@@ -172,7 +172,7 @@ class MeasuredPattern:
             for layer in self._layers
         ]
         if len(parts) == 1:
-            # a cubic spline can be negative next to a deep null, and an amplitude cannot
+            # next to a deep null a cubic spline can be negative, but an amplitude cannot
             return np.maximum(parts[0], 0.0).astype(np.complex128), _zeros(theta, phi)
         return parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
 
@@ -189,13 +189,13 @@ def _spline(torus: FloatArray) -> FloatArray:
 
 
 def _torus(half: ComplexArray | FloatArray, sign: int) -> AnyArray:
-    """Continue rows of theta 0..pi to 2 pi: the far half of each great circle is the meridian at phi + pi."""
+    """Extend the rows from theta = pi to 2 pi: the second half of each great circle is the meridian at phi + pi."""
     opposite = np.roll(half, half.shape[1] // 2, axis=1)
     return np.concatenate([half, sign * opposite[-2:0:-1]], axis=0)
 
 
 def _sphere_mean(gain: FloatArray) -> float:
-    """Return the mean over the sphere of rows theta = 0..pi, exact if the gain is linear in cos theta between rows."""
+    """Return the mean gain over the sphere from rows of theta 0 to pi."""
     theta = np.linspace(0, np.pi, gain.shape[0])
     edges = np.concatenate([[0.0], (theta[1:] + theta[:-1]) / 2, [np.pi]])
     # weight each row by the area of the band around it, which is not zero at a pole
@@ -214,13 +214,13 @@ def _pole_vectors(e_theta: ComplexArray, e_phi: ComplexArray, row: int, slope: f
 
 
 def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Replace the rows of the poles by the single field vector that all samples of a pole measure."""
+    """Replace the row of each pole by one field vector, because all samples at a pole measure the same field."""
     e_theta, e_phi = e_theta.copy(), e_phi.copy()
     phi = np.arange(e_theta.shape[1]) * (2 * np.pi / e_theta.shape[1])
     for row, next_row, slope in ((0, 1, 1.0), (-1, -2, -1.0)):
         x, y, _ = _pole_vectors(e_theta, e_phi, row, slope)
         near_x, near_y, _ = _pole_vectors(e_theta, e_phi, next_row, slope)
-        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # files differ in the sign of the row of a pole
+        if (x * np.conj(near_x) + y * np.conj(near_y)).real < 0:  # some files invert the row of a pole
             x, y = -x, -y
         e_theta[row] = slope * (x * np.cos(phi) + y * np.sin(phi))
         e_phi[row] = y * np.cos(phi) - x * np.sin(phi)
@@ -229,7 +229,7 @@ def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[Co
 
 # ---------------------------------------------------------------- AERPAW text files
 
-# Start of each column name. Spaces and points are removed, because they differ between files of one lab.
+# Start of each column name without spaces and points, which differ even between files of one laboratory.
 _COLUMNS = ("phi", "theta", "etotal", "e(phi)amp", "e(theta)amp", "e(phi)phase", "e(theta)phase")
 
 
@@ -278,7 +278,7 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
     along = _points_along_phi(e_theta.T, e_phi.T)
-    # phi is then the angle of a turntable, and azimuth has the opposite direction
+    # phi is then the angle of a turntable, whose direction is opposite to azimuth
     if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
@@ -293,7 +293,7 @@ READABLE = (
     "(azimuth_deg,gain_dbi and elevation_deg,gain_dbi)"
 )
 
-# Signs of unsupported formats, each with the program or standard that writes it.
+# Text by which unsupported formats are recognised, each with the program or standard that uses it.
 _FOREIGN = (
     (r"\s*(REVNUM|REVDAT)\s*:,", "an NSMA antenna file (.adf, WG16.99.050): save it as MSI Planet"),
     (r"(?s).{0,400}?(//CST Farfield|Theta \[deg\.?\]\s+Phi)", "a far field of CST: save gain in dBi as a sphere CSV"),
@@ -315,7 +315,7 @@ _FREQUENCY = re.compile(
 
 
 def _read_rows(path: Path) -> _Rows:
-    # spreadsheets write a byte-order mark, which would hide the first header
+    # remove the byte-order mark that spreadsheets write, because it would become part of the first header
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
     rows = _Rows(np.zeros((0, 7)))
     values: list[list[float]] = []
@@ -344,7 +344,7 @@ def _read_rows(path: Path) -> _Rows:
 
 
 def _check_last_line(text: str, rows: _Rows) -> None:
-    """Refuse a truncated file, whose last line has no line end and a shorter last number than all others."""
+    """Refuse a truncated file: its last line has no line end, and a shorter last number than all other lines."""
     if not rows.lines or text.endswith(("\n", "\r")):
         return
     lines = text.splitlines()
@@ -390,7 +390,7 @@ def _check_units(rows: _Rows) -> None:
     for columns, what in (((0, 1), "angles"), ((5, 6), "phases")):
         largest = np.abs(values[:, columns]).max(axis=1)
         worst = int(largest.argmax())
-        # accept 0.1 rad beyond a full circle as rounding of the table: larger angles are degrees
+        # accept up to 0.1 rad above a full circle as rounding; larger angles are in degrees
         if largest[worst] > 2 * np.pi + 0.1:
             raise InputError(
                 f"{what} reach {largest[worst]:g}",
@@ -403,7 +403,7 @@ def _check_units(rows: _Rows) -> None:
         raise InputError(
             f"a gain of {values[worst, 2:5].max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", line=rows.lines[worst]
         )
-    # the file also contains the sum, which checks the units
+    # the file also contains the total gain, so its units can be checked
     total = db_from_power(power_from_db(values[:, 3]) + power_from_db(values[:, 4]))
     wrong = np.flatnonzero(np.abs(total - values[:, 2]) > 0.05)
     if len(wrong):
@@ -417,7 +417,7 @@ def _check_units(rows: _Rows) -> None:
 
 
 def _as_grid(rows: _Rows) -> tuple[bool, FloatArray]:
-    """Return whether theta is a full circle, and rows as (phis, thetas, 7) with complete and equally spaced angles."""
+    """Return whether theta covers a full circle, and the rows as (phis, thetas, 7). InputError for gaps."""
     # five digits, because float32 angles of one grid line differ in the seventh
     key = np.round(rows.values[:, :2], 5)
     phi, at_phi = np.unique(key[:, 0], return_inverse=True)
@@ -441,7 +441,7 @@ def _as_grid(rows: _Rows) -> tuple[bool, FloatArray]:
             cause="the file was cut off, or a line is lost" if what == "missing" else "a line was copied",
             line=None if what == "missing" else rows.lines[np.flatnonzero((at_phi == i) & (at_theta == j))[1]],
         )
-    # theta begins at -pi, so phi covers half a circle only
+    # if theta begins at -pi, phi covers only half a circle
     folded = theta[0] < -0.1
     span = np.pi if folded else 2 * np.pi
     phi_expected = np.arange(len(phi)) * (span / len(phi))
@@ -464,10 +464,11 @@ def _as_grid(rows: _Rows) -> tuple[bool, FloatArray]:
 def _unfold(folded: ComplexArray) -> ComplexArray:
     """Convert (2, phis to pi, thetas -pi..pi) to (2, phis to 2 pi, thetas 0..pi).
 
-    Negative theta is the meridian at phi + pi.
+    A negative theta is a point on the meridian at phi + pi.
 
-    There, some files contain spherical components, and other files the components of the cut, which differ in sign. The
-    field is smooth where phi wraps around, and along each meridian next to the poles, which distinguishes both cases.
+    At these points, some files contain spherical components. Others contain the components along the cut, which have
+    the opposite sign. Both cases are distinguished by continuity: the field must be smooth where phi wraps around, and
+    along each meridian next to the poles.
     """
     # column with theta = 0
     middle = folded.shape[2] // 2
@@ -475,7 +476,7 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
     inner = slice(1, -1)
     if _apart(far[:, 0, inner], near[:, -1, inner]) > _apart(-far[:, 0, inner], near[:, -1, inner]):
         far = -far
-    for pole, next_row in ((0, 1), (-1, -2)):  # files differ in the half circle whose sign the row of a pole has
+    for pole, next_row in ((0, 1), (-1, -2)):  # the row of a pole may have the sign of either half circle
         if _apart(near[:, :, pole], near[:, :, next_row]) > _apart(-near[:, :, pole], near[:, :, next_row]):
             near[:, :, pole] *= -1
         far[:, :, pole] = -near[:, :, pole]
@@ -495,7 +496,7 @@ def _mirrored(half: ComplexArray) -> ComplexArray:
 def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
     """Check whether E_phi points along increasing phi, in which case the field near the poles is one vector."""
     scores = []
-    # with the right sign, the rows at both poles are one vector seen from all sides
+    # with the right sign, all samples of a row at a pole describe the same vector
     for sign in (1.0, -1.0):
         score = 0.0
         for row, slope in ((0, 1.0), (1, 1.0), (-2, -1.0), (-1, -1.0)):
@@ -507,18 +508,18 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
 
 
 def check_power(pattern: MeasuredPattern, *, most_db: float = 0.5, cause: str = NOT_GAIN) -> None:
-    """Refuse a pattern that radiates more power than it accepts or almost no power, or whose gains are linear.
+    """Refuse a pattern if it radiates more power than it accepts or almost none, or if its gains are linear.
 
     Parameters
     ----------
     pattern : MeasuredPattern
     most_db : float
-        Largest accepted mean gain over the sphere. A lossless antenna has 0 dB, and the rest allows for measurement
+        Largest accepted mean gain over the sphere. A lossless antenna has 0 dB; the difference allows for measurement
         errors.
     cause : str
         Likely cause of a mean gain out of range, if the values are not linear.
     """
-    # a mean gain of 1 or less requires directions below 0 dBi, but linear gains read as dBi are all above 0
+    # in dBi some directions must be below 0, because the mean gain is at most 1; linear gains are never negative
     linear = pattern.least_gain_dbi >= 0.0 and pattern.peak_gain_dbi - pattern.least_gain_dbi > most_db
     if linear or not _MINIMUM_EFFICIENCY <= pattern.efficiency <= power_from_db(most_db):
         raise InputError(
@@ -546,13 +547,13 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
     Returns
     -------
     MeasuredPattern
-        Pattern with all amplitude in E_theta, real.
+        Pattern with a real E_theta and no E_phi.
 
     Raises
     ------
     InputError
-        If the file is of another kind, angles are missing, degrees and radians are mixed, or more power is radiated
-        than accepted.
+        If the file is of another kind, angles are missing, angles are not all in degrees or all in radians, or more
+        power is radiated than accepted.
     UsageError
         If there is no such grid.
     """
@@ -581,7 +582,7 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
 
 
 def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int]) -> FloatArray:
-    """Return the grid of that name if it has a row per elevation and a column per azimuth."""
+    """Return the named grid if it has a row per elevation and a column per azimuth."""
     sizes = {key: value.shape for key, value in content.items() if isinstance(value, np.ndarray)}
     grids = sorted(key for key, size in sizes.items() if size == shape)
     if variable in grids:

@@ -1,10 +1,10 @@
 """Buildings, forests and geofences from map files: classified, projected, repaired, with a list of all actions.
 
 The height of a building is its ``height`` tag, else ``building:levels`` times 3 m, else the height of the outline
-around a part, else a default. The number of default heights is reported. Within the area of its parts, a building's
-outline is replaced by them. Overlapping buildings of equal height are joined; otherwise the higher one covers the
-ground. Holes are retained. Slivers and duplicates are removed. Single trees have their tagged sizes, and tree rows
-become trees along their line.
+around a part, else a default. The number of default heights is reported. A building's outline is replaced by its parts
+where they cover it. Overlapping buildings of equal height are joined. If the heights differ, the overlap belongs to the
+higher building. Holes are retained. Slivers and duplicates are removed. Single trees have their tagged sizes, and tree
+rows become trees along their line.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from .siteyaml import (
 
 # Storey height that OpenStreetMap suggests.
 _LEVEL_M = 3.0
-# Two storeys, the height of a barn or a house.
+# The height of two storeys, such as a barn or a house.
 _DEFAULT_HEIGHT_M = 6.0
-# Heights are rounded to centimetres, so a lower building would have no height.
+# Smallest height of a building. Heights are rounded to centimetres, so a lower height would become zero.
 _LOWEST_M = 0.01
 # Outlines farther than this from the origin do not belong to the site.
 FAR_M = 20_000.0
 
-# Area of a site without a base: the map up to the first distance from the first tower in each direction, and the second
-# distance around each tower.
+# Area of a site without a base: the part of the map within the first distance of the first tower (east-west and
+# north-south), and the second distance around each tower.
 _AROUND_M, _NEAR_TOWER_M = 2000.0, 500.0
 
 # Smallest and largest number of elevations for a surface (its computing time grows with the cube of the number), and
@@ -72,28 +72,28 @@ _SAME_HEIGHT_M = 0.25
 
 # Height of a wood if the map does not state it: the mean LiDAR height of all forest stands at Lake Wheeler.
 _DEFAULT_CANOPY_M = 20.0
-# Share of evergreen trees for each tag of OpenStreetMap.
+# Share of evergreen trees by tag of OpenStreetMap.
 _EVERGREEN = {"evergreen": 1.0, "needleleaved": 1.0, "mixed": 0.5}
 
 # Margin of forests around the area of the site. Trees farther away do not shade any path.
 _FOREST_MARGIN_M = 1000.0
 
-# Smallest size of a tree or a wood. A smaller girth would be a trunk of 0.00 m in the file of the site.
+# Smallest size of a tree or a wood. A smaller girth would be rounded to a trunk of 0.00 m in site.yaml.
 _SMALLEST_SIZE_M = 0.05
-# The thickest known trunk has a girth of 42 m.
+# Largest plausible girth. The thickest known trunk has a girth of 42 m.
 _WIDEST_GIRTH_M = 45.0
 # Distance between the trees of a row without a tagged crown diameter. At this distance default crowns touch.
 _ROW_SPACING_M = 10.0
 
 _MAXIMUM_ROW_TREES = 10_000
 
-# Progress is reported each time so many outlines are read: a second on a slow machine.
+# Number of outlines between two progress reports. They take a second on a slow machine.
 _OUTLINES_PER_REPORT = 1000
 
 
 @dataclass(slots=True)
 class Footprints:
-    """The elements of map files in the site frame, and the actions on them.
+    """The elements of map files in the site frame, and the changes made to them.
 
     ``actions`` are sentences for the user; those that need a check begin with ``warning:``. ``credits`` name the
     sources of the data. ``assumed`` describes sizes that the maps do not state.
@@ -168,8 +168,8 @@ def import_footprints(
     Raises
     ------
     InputError
-        If a file cannot be read, coordinates are swapped, the file is of another place, heights cannot be metres, or
-        there is no area.
+        If a file cannot be read or describes another place, coordinates are swapped, heights cannot be metres, or there
+        is no area.
     UsageError
         If ``untagged`` is not a kind of area.
     """
@@ -260,7 +260,7 @@ def _single_trees(tree: mapfiles.TreeLine, frame: SiteFrame, actions: list[str])
         tags["circumference"] = f"{written} cm"
     girth = _size(tags, ("circumference",), _WIDEST_GIRTH_M, "a trunk {:g} m around", notes)
     points = np.stack(frame.to_local(*np.array(tree.positions, dtype=np.float64).reshape(-1, 2).T), axis=1)
-    # a truncated number of degrees projects to infinity
+    # a truncated position can project to infinity
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points) or float(np.hypot(*points.mean(axis=0))) > FAR_M:
         actions.append(f"{tree.source}: a tree is skipped, because it is not at the site")
@@ -277,7 +277,7 @@ def _single_trees(tree: mapfiles.TreeLine, frame: SiteFrame, actions: list[str])
 
 
 def _size(tags: Mapping[str, str], keys: tuple[str, ...], most_m: float, what: str, notes: list[str]) -> float | None:
-    """Return a size of a tree or a wood [m]. If too small or too large, it is noted and not used."""
+    """Return a size of a tree or a wood [m]. A size that is too small or too large is noted and not used."""
     size = mapfiles.positive_metres(tags, keys, notes)
     if size is None or _SMALLEST_SIZE_M <= size <= most_m:
         return size
@@ -312,7 +312,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
 def _fill(result: Footprints, shapes: dict[mapfiles.Kind, list[_Shape]], canopy_m: float | None) -> None:
     actions = result.actions
     buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
-    # where woods overlap, keep the first one in the file, because woods have no heights to compare
+    # where woods overlap, use the first in the file, because woods have no heights to compare
     woods = _first_keeps(_without_duplicates(shapes["forest"], actions), actions)
     for name, shape, area in _parts(buildings, actions):
         result.buildings.append(
@@ -343,14 +343,14 @@ def _fill(result: Footprints, shapes: dict[mapfiles.Kind, list[_Shape]], canopy_
 
 
 def _check_place(content: mapfiles.MapFile, frame: SiteFrame) -> None:
-    """Refuse a file whose outlines are all far away, and report if swapped coordinates would be near."""
+    """Refuse a file whose outlines are all far away. The message says if swapped coordinates would be near."""
     positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer]
     positions += [p for tree in content.trees for p in tree.positions]
     if not positions:
         return
     latitude, longitude = np.array(positions).T
     away = float(_distance_m(latitude, longitude, frame).min())
-    # one near outline is sufficient, because a file may extend beyond the site
+    # a single near outline is sufficient, because a map may extend beyond the site
     if away <= FAR_M:
         return
     spans = [abs(np.diff([p[1] for p in outer])).max(initial=0) for o in content.outlines for outer, _ in o.parts]
@@ -374,7 +374,7 @@ def _check_place(content: mapfiles.MapFile, frame: SiteFrame) -> None:
 def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
     """Return the approximate distance from the origin [m], or inf for an impossible position."""
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
-    # replace invalid values, because a truncated number may be 1e306
+    # replace invalid values, because a damaged number may be as large as 1e306
     north = np.where(good, latitude, 0.0) - frame.latitude_deg
     # use the shorter way around the Earth
     turn = (np.where(good, longitude, 0.0) - frame.longitude_deg + 180) % 360 - 180
@@ -386,7 +386,7 @@ def _project(outline: mapfiles.Outline, frame: SiteFrame, actions: list[str]) ->
     """Return the valid outline in metres, or None and a line in ``actions`` if nothing remains."""
     areas, notes = [], []
     for outer, holes in outline.parts:
-        # no outline spans half of the Earth, so a larger jump means that it crosses the antimeridian
+        # no outline spans half of the Earth, so a jump of more than 180 degrees means that it crosses the antimeridian
         if max(np.abs(np.diff([p[1] for p in outer])), default=0) > 180:
             notes.append("crosses the antimeridian; its parts were joined")
         ring = _ring(outer, frame)
@@ -431,7 +431,7 @@ def _why_no_ring(positions: Sequence[mapfiles.Position]) -> str:
 
 
 def _ring(positions: Sequence[mapfiles.Position], frame: SiteFrame) -> Polygon | None:
-    # a ring repeats its first point, and some repeat all points
+    # rings repeat their first point, and some files repeat all points
     if len(set(positions)) < 3:
         return None
     latitude, longitude = np.array(positions).T
@@ -447,7 +447,7 @@ def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
         notes.append(f"a ring that crosses itself at more than {mapfiles.MAX_CROSSINGS} places is skipped")
         return Polygon()
     notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
-    # "structure" retains areas that a ring encloses twice; "linework" would make holes of them
+    # "structure" retains areas that a ring encloses twice; "linework" would turn them into holes
     return _areas_only(shapely.make_valid(ring, method="structure"))
 
 
@@ -480,15 +480,15 @@ def _describe(shape: _Shape, outline: mapfiles.Outline, actions: list[str]) -> N
     actions += [f"{shape.source}: {note}" for note in notes]
     shape.height_m = height
     shape.material = mapfiles.material_of(tags)
-    # a metre has 3.28 feet, so such a ratio of height to storeys is suspicious
+    # a metre is 3.28 feet, so a height of about 3.28 times the levels is probably in feet
     if height > 2 * _LEVEL_M and levels and 2.7 <= height / (levels * _LEVEL_M) <= 4.5:
         shape.stated = False  # counted by _warn_of_feet
         actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
 
 
 def _inherit(shapes: list[_Shape], actions: list[str]) -> None:
-    """Set the height of parts without a height to that of the building whose outline contains them."""
-    # complete buildings with a stated height
+    """Give parts without a height the height of the building whose outline contains them."""
+    # use only complete buildings with a stated height
     known = [shape for shape in shapes if not (shape.part or shape.assumed)]
     tree = shapely.STRtree([shape.area for shape in known])
     for part in (shape for shape in shapes if shape.part and shape.assumed):
@@ -517,7 +517,7 @@ def _describe_wood(shape: _Shape, tags: Mapping[str, str], actions: list[str]) -
 
 
 def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
-    """Warn if most stated heights are those of tower blocks, because the map is probably in feet."""
+    """Warn if the median stated height is above 20 m, because the map is then probably in feet."""
     stated = [shape.height_m for shape in shapes if shape.stated]
     if len(stated) >= 3 and float(np.median(stated)) > 20 and max(shape.area.area for shape in shapes) < 50_000:
         actions.append(
@@ -590,7 +590,7 @@ def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
     disjoint: list[_Shape] = []
-    # begin with the highest, because a shape below a higher roof is not visible
+    # begin with the highest shape, because parts of other shapes below it are not visible
     for shape in sorted(group, key=lambda shape: -shape.height_m):
         over = [higher for higher in disjoint if higher.area.intersects(shape.area)]
         free = _areas_only(shape.area.difference(shapely.union_all([higher.area for higher in over])))
@@ -632,7 +632,7 @@ def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, 
     parts: list[tuple[str, _Shape, Polygon]] = []
     used: set[str] = set()
     for shape in shapes:
-        # round to the precision of site.yaml here, because rounding coordinates separately can make a ring cross itself
+        # round to the precision of site.yaml here, because a ring whose coordinates are rounded later can cross itself
         for part in shapely.get_parts(_areas_only(shapely.set_precision(shape.area, _GRID_M))):
             plain = part.simplify(_SLIVER_M / 2)
             plain = plain if isinstance(plain, Polygon) and plain.is_valid and not plain.is_empty else part
@@ -670,14 +670,14 @@ def import_site(
     files : sequence of paths
         Map files.
     base : str or path, optional
-        Packaged site or site.yaml that provides towers and settings. Without ``towers`` the default is Lake Wheeler, if
+        Packaged site or site.yaml that provides towers and settings. Without ``towers``, the default is Lake Wheeler if
         the map is of that area.
     towers : sequence of str
-        ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace those of ``base``.
-        Without a base the first one is the origin. The ground is then a smooth surface through the elevations in the
-        map (tag ``ele``) if there are three or more, else flat.
+        ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace the towers of
+        ``base``. Without a base, the first tower is the origin. If the map has three or more elevations (tag ``ele``),
+        the ground is then a smooth surface through them. Otherwise it is flat.
     dem : str or path, optional
-        Elevation model of the ground, heights above sea level. It replaces that of ``base``.
+        Elevation model of the ground, heights above sea level. It replaces the elevation model of ``base``.
     dem_crs : str, optional
         Coordinate system of ``dem``, for ASCII grids.
     **options
@@ -710,7 +710,7 @@ def import_site(
         model = site_model(base)
         frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
         content, area_m = model.model_dump(), extent_m(model, frame)
-        if model.dem is not None:  # the new file may be in another folder
+        if model.dem is not None:  # the path must be valid in another folder
             content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
     content |= {"towers": named_towers} if towers else {}
     if dem is not None:
@@ -719,7 +719,7 @@ def import_site(
     about = [] if base is not None else _around_towers(content, imports, frame)
     actions = _from_maps(content, imports)
     model = SiteModel.model_validate(content)
-    site = build_site(model)  # fails now if elevations or towers are elsewhere
+    site = build_site(model)  # raises an error if elevations or towers are elsewhere
     actions += [f"warning: {text}" for text in site.cautions()]
     return model, [*(about or [_kept_of_base(model, str(base))]), *actions]
 
@@ -756,7 +756,7 @@ def _around_towers(content: dict[str, Any], imports: Footprints, frame: SiteFram
 
 
 def name_and_value(text: str, option: str, example: str) -> tuple[str, str]:
-    """Return both sides of ``NAME=VALUE``, the text of an option. UsageError if one of them is missing."""
+    """Return name and value of an option of the form ``NAME=VALUE``. UsageError if either is missing."""
     name, mark, value = text.partition("=")
     if not (mark and name.strip() and value):
         raise UsageError(f"{option} '{text}'", expected=f"{option} {example}")
@@ -795,7 +795,7 @@ def numbers_of(text: str, counts: tuple[int, ...], what: str, expected: str) -> 
 
 
 def numbers_of_towers(towers: Sequence[str], form: str) -> dict[str, list[float]]:
-    """Return the three numbers of each ``NAME=A,B,C`` of ``--tower`` by name. UsageError if two have one name."""
+    """Return the three numbers of each ``NAME=A,B,C`` of ``--tower`` by name. UsageError for a repeated name."""
     by_name: dict[str, list[float]] = {}
     for text in towers:
         name, place = name_and_value(text, "--tower", form)
@@ -821,7 +821,7 @@ def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:
 
 
 def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
-    """Replace outlines and trees of the base by those of maps, and return the actions."""
+    """Replace the outlines and trees of the base with the contents of maps, and return the actions."""
     content |= {
         "buildings": [
             _outline_dict(b.name, b.footprint) | {"height_m": b.height_m, "material": b.material, "source": b.source}

@@ -46,7 +46,8 @@ _INDEX = "learned.yaml"
 # The bands of Lake Wheeler at 3.3, 3.4 and 3.51 GHz differ by 3 % and have different antennas and gains.
 BAND = 0.02
 
-# Limit for an airframe. 3.3 and 3.51 GHz share 90 % of the variance of its gain. There are no data for other bands.
+# Relative difference of carriers up to which an airframe is used. Its gains at 3.3 and 3.51 GHz share 90 % of their
+# variance. There are no data for other bands.
 AIRFRAME_BAND = 0.07
 
 
@@ -62,9 +63,9 @@ class Source(StrictModel):
 class Errors(StrictModel):
     """Mean errors over held-out series: RMSE after one offset [dB], and the share inside 90 % intervals.
 
-    ``rmse_db`` is that of held-out flights. ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are those of
-    heights, azimuth sectors at the tower and headings that are not in the training flights. ``heights_m`` are cruise
-    heights.
+    ``rmse_db`` is the error on held-out flights. ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are the
+    errors at heights, azimuth sectors of the tower and headings that are not in the training flights. ``heights_m`` are
+    the cruise heights of the flights.
 
     Parameters
     ----------
@@ -84,14 +85,14 @@ class Errors(StrictModel):
     heights_m: list[float] = Field(default_factory=list)
 
     def expected(self, height_m: float, *, unseen: bool) -> tuple[Errors, str]:
-        """Return the errors with the RMSE for a kind of flight, and the name of the kind.
+        """Return the errors, with the RMSE for the kind of flight, and a text that names this kind.
 
         Parameters
         ----------
         height_m : float
             Cruise height; NaN if it is not known.
         unseen : bool
-            True if most directions were not flown.
+            True if most directions of the flight are not in the training flights.
         """
         new_height = bool(self.heights_m) and min(abs(height_m - h) for h in self.heights_m) > _SAME_HEIGHT_M
         kinds = (
@@ -112,11 +113,11 @@ _SAME_HEIGHT_M = 5.0
 class LearnedLock(StrictModel):
     """The lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) [path gain in dB].
 
-    Levels in lock have mean ``locked_db`` at ``gain_db`` and the SD ``locked_sd_db`` in a flight. They increase by
-    ``locked_per_db`` for each dB of path gain. This is less than 1, because weak levels are in lock only if they are
-    stronger than expected. The values that begin with ``lost`` describe levels without lock [unit of the measurement].
-    The scores are means over held-out flights: the Brier and log score (nat) of the model and of a constant share, and
-    the RMSE of all samples if levels below the floor are replaced by the floor [dB].
+    Levels in lock have the mean ``locked_db`` at a path gain of ``gain_db``, and the SD ``locked_sd_db`` within a
+    flight. They increase by ``locked_per_db`` for each dB of path gain. This factor is less than 1, because a weak
+    signal is in lock only if it is stronger than expected. The values that begin with ``lost`` describe levels without
+    lock [unit of the measurement]. The scores are means over held-out flights. They are the Brier and log score (nat)
+    of the model and of a constant share, and the RMSE of all samples if the floor replaces levels below it [dB].
     """
 
     gain_db: float
@@ -178,7 +179,7 @@ class LearnedAntenna(StrictModel):
     Parameters
     ----------
     sha256 : str
-        SHA-256 of the table. Another table is refused.
+        SHA-256 of the table. A table with another SHA-256 is refused.
     command : str
         Command that learns the antenna again.
     """
@@ -190,7 +191,7 @@ class LearnedAntenna(StrictModel):
 
 
 class LearnedHealth(StrictModel):
-    """Errors of held-out flights of one channel, with which a later flight is compared.
+    """Errors of held-out flights of one channel, for comparison with a later flight.
 
     ``rmse_db`` is the mean over flights of the RMSE of 1-s means, with its SD. The error of 4-s means has two parts.
     ``slow_sd_db`` is correlated over a time and a length, and ``white_sd_db`` is not. The usual offset is that of
@@ -203,9 +204,9 @@ class LearnedHealth(StrictModel):
     channel_difference_sd_db : mapping of str to float
         SD over flights of the difference of offsets to another channel of the tower, by channel.
     below_lock_share : float, optional
-        Mean share of samples without lock. None for receivers that do not report their lock.
+        Mean share of samples without lock. None if the receiver does not report its lock.
     run_s : float
-        Typical length of the longest run of equal readings [s].
+        Typical duration of the longest run of equal levels [s].
     """
 
     flights: int
@@ -222,7 +223,7 @@ class LearnedHealth(StrictModel):
 
     @property
     def most_rmse_db(self) -> float:
-        """RMSE that healthy flights rarely exceed: mean + 2 SD [dB]."""
+        """RMSE that flights with intact equipment rarely exceed: mean + 2 SD [dB]."""
         return self.rmse_db + 2.0 * self.rmse_sd_db
 
 
@@ -242,9 +243,10 @@ class LearnedSeries(StrictModel):
     sd_db : float
         Mean standard deviation of the level over flown directions.
     shares_airframe : bool
-        False if the gain of the UAV does not predict held-out flights of its campaign. Then it is not used elsewhere.
+        False if the gain of the UAV does not predict held-out flights of its campaign. It is then used only for this
+        campaign.
     level : LearnedLevel, optional
-        Level above free space, or the level in lock for receivers that lose it.
+        Level above free space. For receivers that can lose their lock, only levels in lock are used.
     """
 
     tower: str
@@ -276,7 +278,7 @@ class LearnedReceiver(StrictModel):
     Parameters
     ----------
     quantity : str
-        Rank from which it was learned, such as ``scheduled PDSCH rank``, for any reader.
+        Rank from which the receiver was learned, such as ``scheduled PDSCH rank``. It is only for readers.
     """
 
     tower: str
@@ -298,7 +300,7 @@ class Entry(StrictModel):
     trained_on : list of str
         SHA-256 of all logs of the calibration.
     tables : mapping of str to str
-        SHA-256 of the tables as written. No other file is replaced or removed.
+        SHA-256 of the tables as written. Only files with these digests are replaced or removed.
     sha256 : str
         SHA-256 of all other values of the entry.
     """
@@ -342,7 +344,7 @@ _Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 
 
 class Learned(StrictModel):
-    """All learned models of a site, by name. ``names`` shows that no entry of the file is missing."""
+    """All learned models of a site, by name. The list ``names`` shows if an entry of the file is missing."""
 
     format: Literal["aerpaw-cmp learned 3"] = "aerpaw-cmp learned 3"
     names: list[_Name] = Field(default_factory=list)
@@ -430,7 +432,7 @@ def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | No
 
 
 def mend_remark(folder: Path, learning: Container[str]) -> list[str]:
-    """Return a sentence about a damaged index that is written again while the entries ``learning`` are learned."""
+    """Return a sentence about a damaged index that is rewritten when the entries ``learning`` are learned."""
     _, lost, damage = mended_index(folder)
     if damage is None:
         return []
@@ -482,7 +484,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         Name of the entry. An existing entry of this name is replaced.
     entry : Entry
     files : mapping of str to bytes
-        Uncompressed content of the tables, by name with the ending ``.gz``.
+        Content of the tables before compression, by name with the ending ``.gz``.
 
     Returns
     -------
@@ -496,17 +498,18 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         The same as in :func:`read_learned`, or if the folder cannot be written.
     """
     folder = folder_of(site)
-    # mtime=0, so that the same content has the same bytes and SHA-256
+    # with mtime=0, equal content has equal bytes and the same SHA-256
     packed = {file: gzip.compress(content, 9, mtime=0) for file, content in files.items()}
     tables = {file: hashlib.sha256(content).hexdigest() for file, content in packed.items()}
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
-        # if two calibrations of one site run at once, each must see the entry of the other
+        # if two calibrations of one site run at once, neither may overwrite the entry of the other
         with locked(folder):
             memory, _, damage = mended_index(folder)
             if damage is not None:
                 write_whole(damaged_copy(folder), (folder / _INDEX).read_bytes())
-            # replace only our files: those with a digest in an entry, edited tables, and tables of a killed calibration
+            # replace only files of calibrations: files with a digest in an entry, edited tables, and tables of a killed
+            # run
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:
                 place = inside(folder, file, folder / _INDEX, plain=True)
@@ -527,14 +530,14 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
             write_whole(folder / _INDEX, dump_yaml(memory.model_dump(mode="json", exclude_none=True)))
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):
-                # do not remove a table that was changed later
+                # do not remove a table that a user has changed
                 if file not in used and (folder / file).is_file() and file_digest(folder / file) == digest:
                     (folder / file).unlink()
     return [folder / _INDEX, *(folder / file for file in files)]
 
 
 def carry_memory(base: str | Path, site: Path) -> list[str]:
-    """Copy the learned models of a base site next to a new site, and return a line about it."""
+    """Copy the learned models of a base site next to a new site, and return a line that says so."""
     origin, folder = folder_of(base), folder_of(site)
     if not origin.is_dir() or (folder / _INDEX).exists():
         return []
@@ -569,7 +572,7 @@ def files_of(entry: Entry) -> set[str]:
     return {file for s in entry.series for file in s.files} | {r.file for r in entry.receivers}
 
 
-# Start of the comment that contains the calibration and, after ``, from``, its flights.
+# Start of the comment that names the calibration and, after ``, from``, its flights.
 LEARNED = "# aerpaw-cmp calibrate: "
 
 
@@ -607,7 +610,7 @@ def read_table(path: Path, expected: str, written: Written | None = None) -> byt
     ------
     OSError
     InputError
-        If the file is too large, damaged, or not as it was written.
+        If the file is too large or damaged, or has changed since it was written.
     """
     missing = written is not None and not path.exists()
     content = b"" if missing else read_bounded(path, LARGEST_TABLE, expected)
@@ -623,7 +626,7 @@ def read_table(path: Path, expected: str, written: Written | None = None) -> byt
     if not content.startswith(b"\x1f\x8b"):
         return content
     with parsing(path, expected, "a cut copy"), gzip.open(path) as book:
-        # one byte more than allowed shows that a table is too large, without decompressing all of it
+        # read one byte more than allowed, which shows that a table is too large without decompressing all of it
         unpacked = book.read(LARGEST_TABLE + 1)
     if len(unpacked) > LARGEST_TABLE:
         raise InputError(f"it unpacks to more than {LARGEST_TABLE} bytes", expected=expected, path=path)
@@ -641,7 +644,7 @@ class Named(StrictModel):
         """Return the series whose antenna fits an end (``uav``, ``tower``) of a link, or None."""
         if end == "tower":
             return next((s for s in self.entry.series if f"{s.tower}.{s.channel}" == self.part), None)
-        # an airframe has one antenna for all channels of a band
+        # all channels of a band share the antenna of the airframe
         return min(self.entry.series, key=lambda s: abs(s.carrier_hz / carrier_hz - 1.0), default=None)
 
     def written(self, file: str) -> Written:
@@ -649,7 +652,7 @@ class Named(StrictModel):
         return Written(self.entry.tables[file], self.entry.command)
 
 
-class UnknownName(UsageError):  # noqa: N818  # a case of its base, which is the error
+class UnknownName(UsageError):  # noqa: N818  # a special case of UsageError
     """The error for a name that no learned model has."""
 
 
@@ -662,7 +665,7 @@ def find_named(name: str, folder: Path, end: str = "") -> Named:
     folder : Path
         Folder of sites that are not packaged, with SITE.learned.
     end : {"uav", "tower", "receiver", ""}
-        Required part: the airframe, the antenna of a tower, a rank receiver, or any.
+        Required part: the airframe, the antenna of a tower, a rank receiver, or any part.
 
     Raises
     ------
@@ -704,8 +707,8 @@ def _parts(name: str, entry: Entry, end: str) -> dict[str, str]:
     return parts
 
 
-# Share of the variance by which rounded values may differ from the function.
-# The table has gains to 0.01 dB and angles to 0.1 deg, so the gains of close directions may contradict each other.
+# Variance of the rounding errors of known values, as a share of the process variance. The table has gains to 0.01 dB
+# and angles to 0.1 deg, so the gains of close directions may contradict each other.
 _NUGGET = 1e-3
 
 
@@ -737,7 +740,7 @@ class PairGain:
     @cached_property
     def _factor(self) -> Factor:
         matrix = gaussian_kernel(self.directions, self.directions, self.length)
-        # repeated directions would make two equal rows, which have no factor
+        # without this term, repeated directions would make the matrix singular
         matrix[np.diag_indices(len(matrix))] += _NUGGET
         return Factor.of(matrix)
 
@@ -749,7 +752,7 @@ class PairGain:
         directions : (n, 6)
             Directions, as in the parameter ``directions`` of the class.
         apart_sd_db : (n,)
-            Standard deviation of both antennas if each were learned separately [dB].
+            Joint standard deviation of the gains of both antennas, if each is learned separately [dB].
 
         Returns
         -------
@@ -757,8 +760,9 @@ class PairGain:
 
         Notes
         -----
-        The variance is a weighted mean of the variance of the record and of the sum of the variances of antennas and
-        prior. The weight of the record is the share of the process variance that the known directions determine.
+        The variance is a weighted mean. One term is the variance in the table near the direction, and the other is the
+        sum of the variances of antennas and prior. The weight of the first term is the share of the process variance
+        that the known directions determine.
         """
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
         white = self._factor.whiten(self.gain_db)
@@ -767,7 +771,7 @@ class PairGain:
             part = slice(start, start + 4096)
             across = gaussian_kernel(directions[part], self.directions, self.length)
             gain[part], known = self._factor.condition(across, white)
-            # rounding can exceed 1 at a known direction
+            # due to rounding, the share can exceed 1 at a known direction
             known = np.minimum(known, 1.0)
             near = across @ self.sd_db**2 / np.maximum(across.sum(axis=1), 1e-12)
             away = apart_sd_db[part] ** 2 + self.prior_sd_db**2
@@ -861,7 +865,7 @@ class SpherePattern(MeasuredPattern):
     Attributes
     ----------
     pair : PairGain or None
-        Gain towards both ends at once, in addition to that of the antenna of a tower.
+        Gain towards both ends at once, in addition to the gain of the tower's antenna.
     spread : LearnedSpread or None
         Error model of a level without the SD of the gain.
     """
@@ -905,7 +909,7 @@ def sphere_grid(step_deg: float = 5.0) -> tuple[FloatArray, FloatArray, FloatArr
 def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
     """Return a grid (thetas, phis) [dB] whose mean power over the sphere is that of an isotropic antenna.
 
-    The level of a learned gain is not determined, because the offset contains it.
+    The mean of a learned gain is not determined, because it cannot be separated from the offset.
     """
     theta = np.linspace(0.0, np.pi, gain_db.shape[0])
     # weight by the area of a ring, which is zero at a pole
@@ -914,7 +918,7 @@ def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
 
 
 def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = (), decimals: int = 3) -> str:
-    """Return the text of an antenna file: comment lines, a header, a line per direction.
+    """Return the text of an antenna file: comment lines, a header, and a line per direction.
 
     Parameters
     ----------
@@ -947,7 +951,7 @@ def _table(notes: Sequence[str], columns: Sequence[str], lines: Iterable[str]) -
 def read_sphere_csv(path: str | Path, written: Written | None = None) -> SpherePattern:
     """Read an antenna file of :func:`sphere_csv`.
 
-    Azimuth is counter-clockwise from the x axis of the device, and elevation is up.
+    Azimuth is counter-clockwise from the x axis of the device, and positive elevation is upwards.
 
     Parameters
     ----------
@@ -967,7 +971,7 @@ def read_sphere_csv(path: str | Path, written: Written | None = None) -> SphereP
 
 @lru_cache(maxsize=64)
 def _pattern_of(text: str, path: Path) -> SpherePattern:
-    """Return the antenna in the text of a file. It is cached, because each draft reads all learned models of a site."""
+    """Return the antenna in the text of a file. It is cached, because each draft reads all models of a site."""
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if line.strip() and line[0] != "#"]
     header = [cell.strip() for cell in numbered[0][1].split(",")] if numbered else []
     if header[:3] != list(SPHERE_COLUMNS[:3]):
@@ -982,7 +986,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     _check_grid(azimuth, elevation, len(values), path)
     row = np.argmin(np.abs(elevation[None, :] - values[:, 1:2]), axis=1)
     column = np.argmin(np.abs(azimuth[None, :] - values[:, :1] % 360.0), axis=1)
-    # the grid is complete by number, so a repeated direction means that another is missing
+    # the number of rows is right, so a repeated direction means that another direction is missing
     if len(np.unique(row * len(azimuth) + column)) != len(values):
         raise InputError("a direction is given twice", expected="each direction once", path=path)
     gain, sd = np.zeros((2, len(elevation), len(azimuth)))
@@ -997,7 +1001,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
 
 
 def _row(line: str, number: int, width: int, path: Path) -> list[float]:
-    """Return the numbers of a line. Raise InputError if they are not a gain in a direction."""
+    """Return the numbers of a line. Raise InputError if they are not a direction with its gain."""
     cells = next(csv.reader([line]))
     try:
         row = [float(cell) for cell in cells]
@@ -1035,8 +1039,8 @@ def _check_grid(azimuth: FloatArray, elevation: FloatArray, count: int, path: Pa
 def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes: Sequence[str] = ()) -> str:
     """Return comments and the two principal cuts as MSI Planet text: attenuation below the peak, 360 lines each.
 
-    HORIZONTAL runs clockwise from above, as in planning tools. VERTICAL begins at the horizon in front and goes down
-    first.
+    HORIZONTAL is clockwise as seen from above, as in planning tools. VERTICAL begins at the horizon in front and first
+    goes down.
 
     Parameters
     ----------
@@ -1113,7 +1117,7 @@ def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, Le
     named : Named
     end : {"uav", "tower"}
     carrier_hz : float
-        Carrier at which it is used [Hz].
+        Carrier of the link [Hz].
 
     Raises
     ------
@@ -1177,7 +1181,7 @@ def check_band(learned_hz: float, used_hz: float, band: float, key: str = "") ->
 
 
 def receiver_file(named: Named, carrier_hz: float) -> Path:
-    """Return the file of a learned rank receiver. Check its band, and that it was learned from the logs of its entry.
+    """Return the file of a learned rank receiver, after a check of its band and its training logs.
 
     Parameters
     ----------
@@ -1202,7 +1206,7 @@ def receiver_file(named: Named, carrier_hz: float) -> Path:
 
 
 def check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
-    """Refuse a table that was learned from logs that its entry does not name, because scores rely on this list."""
+    """Refuse a table learned from logs that its entry does not name, because they could otherwise be scored."""
     strange = set(trained_on) - set(named.entry.trained_on)
     if strange:
         raise InputError(

@@ -40,7 +40,7 @@ OSM_CREDIT = "(c) OpenStreetMap contributors, ODbL"
 # Latitude and longitude [deg].
 Position = tuple[float, float]
 
-# Exceptions of an element that cannot be read. The element is skipped and listed, and other elements are used.
+# Exceptions raised by an element that cannot be read. The element is skipped and listed, and all others are used.
 BROKEN_ELEMENT = (InputError, TypeError, KeyError, AttributeError, IndexError, ValueError, OverflowError)
 
 
@@ -57,7 +57,7 @@ class Outline:
     tags : mapping of str to str
         Tags of the file.
     parts : list of (outer ring, hole rings)
-        Positions in degrees, as written.
+        Positions in degrees, unchanged.
     broken : list of str
         Errors in the area.
     """
@@ -80,7 +80,7 @@ class TreeLine:
 
 @dataclass(slots=True)
 class MapFile:
-    """The outlines and trees of a file, sentences about other elements, and the source of the data if it is known.
+    """The outlines and trees of a file, sentences about skipped elements, and the source of the data if it is known.
 
     Parameters
     ----------
@@ -114,10 +114,10 @@ MAX_CROSSINGS = 1000
 
 
 def is_tangled(ring: Polygon) -> bool:
-    """Check whether a ring has more than :data:`MAX_CROSSINGS` self-intersections. Counting stops at this number."""
+    """Check whether a ring has more than :data:`MAX_CROSSINGS` self-intersections. The count stops there."""
     line = np.asarray(ring.exterior.coords)[:, :2]
     segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
-    # a short ring has fewer pairs of segments than allowed intersections
+    # a short ring has fewer pairs of segments than the allowed number of intersections
     if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
         return False
     tree, crossings = shapely.STRtree(segments), 0
@@ -141,7 +141,7 @@ def lonlat(point: Any, where: str) -> Position:
 
 @contextmanager
 def noting_damage(notes: list[str], path: Path, what: str) -> Iterator[None]:
-    """Turn the error of a damaged element into a note that it is left out."""
+    """Turn the error of a damaged element into a note that the element is omitted."""
     try:
         yield
     except BROKEN_ELEMENT as error:
@@ -157,7 +157,7 @@ _FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees
 _NOT = ("no", "", "none", "false", "0")
 _UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT_M}
 _UNIT_WORDS = {"metre": "m", "meter": "m", "foot": "ft", "feet": "ft"}
-# Words of OpenStreetMap for materials that have another name in P.2040.
+# Values of OpenStreetMap for materials that have another name in P.2040.
 _MATERIAL_WORDS = {
     "steel": "metal",
     "aluminium": "metal",
@@ -168,7 +168,7 @@ _MATERIAL_WORDS = {
 
 
 def kind_of(tags: Mapping[str, str]) -> Kind | None:
-    """Return the kind of an area, or None if its tags have none.
+    """Return the kind of an area, or None if its tags do not state a kind.
 
     Examples
     --------
@@ -180,7 +180,7 @@ def kind_of(tags: Mapping[str, str]) -> Kind | None:
         return "building"
     if any(tags.get(key) == value for key, value in _FOREST_TAGS):
         return "forest"
-    # keys of our own exports and of hand-made GeoJSON
+    # this program's exports and manually written GeoJSON use these keys
     word = tags.get("kind", tags.get("type", ""))
     for kind in ("building", "forest", "geofence"):
         if word == kind or (kind == "geofence" and kind in tags):
@@ -207,7 +207,7 @@ def below_ground(tags: Mapping[str, str]) -> bool:
     """
     if "underground" in (tags.get("location", "").lower(), tags.get("parking", "").lower()):
         return True
-    # objects with a negative layer are below others
+    # objects in a negative layer are below the ground
     layer = _number(tags.get("layer", ""))
     tunnel = any(tags.get(key, "no").lower() not in _NOT for key in ("tunnel", "is_underground"))
     if tunnel or (layer is not None and layer < 0):
@@ -242,7 +242,7 @@ def material_of(tags: Mapping[str, str]) -> str:
 def metres(text: str) -> float | None:
     r"""Return the length of a tag [m], or None: ``12``, ``12 m``, ``350 cm``, ``40 ft``, ``40'``, ``39'4"``, ``12,5``.
 
-    ``1,200`` is None, because the comma can be a decimal comma or separate thousands.
+    ``1,200`` is None, because its comma can be a decimal comma or a separator of thousands.
 
     Examples
     --------
@@ -254,7 +254,7 @@ def metres(text: str) -> float | None:
         text = text.replace(typed, plain)
     if re.search(r"\d,\d{3}(?!\d)", text):
         return None
-    # a comma is a decimal comma here, because thousands were refused above
+    # the comma is a decimal comma, because ambiguous numbers were refused above
     text = text.replace(",", ".")
     if match := re.fullmatch(r"(-?\d+(?:\.\d+)?)\s*(m|cm|km|ft|metre|meter|foot|feet)?s?\.?", text):
         unit = match.group(2) or "m"
@@ -301,7 +301,7 @@ _STOREYS = re.compile(r"(building)?levels|(n|num|no|noof|numberof)?(floors|stor(
 
 
 def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
-    """Return the height of a building [m] from any of the tags that programs use. The unit is that of tag or value.
+    """Return the height of a building [m] from any of the tags that programs use, in the unit of the tag or value.
 
     Examples
     --------
@@ -311,7 +311,7 @@ def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     names = [name for name in tags if re.search("height|hgt|hght", name.lower())]
     names = [name for name in names if not _OTHER_HEIGHTS.search(name.lower())]
     first = ("height", "building:height", "height_m", "est_height")
-    # the key of OpenStreetMap comes first, then other columns in the order of the file
+    # use the key of OpenStreetMap first, and then other columns in the order of the file
     for name in sorted(names, key=lambda n: first.index(n) if n in first else len(first)):
         named = _UNIT_AT_END.search(name.lower())
         unit = named[1] if named else "ft" if _FEET.search(name.lower()) else tags.get(f"{name}_unit", "")
@@ -324,7 +324,7 @@ def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
 
 
 def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
-    """Return the number of levels, which is the largest of several (``2;3``)."""
+    """Return the number of levels. The largest of several values (``2;3``) is used."""
     named = (value.strip() for name, value in tags.items() if _STOREYS.fullmatch(re.sub(r"[^a-z]", "", name.lower())))
     written = next(filter(None, named), "")
     if not written:
@@ -399,7 +399,7 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path) -> MapFile
 
 
 def _sort(element: Element, number: int, data: _Data) -> None:
-    """Store an element under its id. An element that occurs twice has the tags and points of both."""
+    """Store an element under its id. If an element occurs twice, both are merged."""
     if element.get("visible") == "false" or element.get("action") == "delete":
         return
     identity = str(element.get("id", f"without id, element {number}"))
@@ -434,7 +434,7 @@ def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, line
         result.trees.append(TreeLine(outline.source, outline.tags, tuple(ring)))
         result.notes += [f"{outline.source}: {fault}" for fault in outline.broken]
         return
-    # "out geom" has positions but no ids, so a ring closes by position
+    # "out geom" contains positions but no ids, so compare positions to close a ring
     references = way.get("nodes") or ring
     if not references or references[0] != references[-1]:
         if kind_of(outline.tags) is None:
@@ -469,16 +469,16 @@ def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
 
 
 def _relations(data: _Data, result: MapFile, lines: Counter[str]) -> set[str]:
-    """Add multipolygons and return the ways that are part of them and must not be added again."""
+    """Add multipolygons. Return the ways that belong to them and must not be added separately."""
     used_ways: set[str] = set()
     for identity, relation in data.relations.items():
         tags = _words(relation.get("tags"))
-        # other relations, such as sites and routes, bound no area
+        # other relations, such as sites and routes, are not areas
         if tags.get("type") not in ("multipolygon", "boundary"):
             if kind_of({k: v for k, v in tags.items() if k != "type"}):
                 lines[f"relations of type '{tags.get('type', '')}'"] += 1
             continue
-        # old relations have an empty role for an outer way
+        # in old relations, the role of an outer way is empty
         outer = [str(m.get("ref")) for m in relation.get("members") or [] if m.get("role") in ("outer", "", None)]
         own = {ref: words for ref in outer if (words := _words((data.ways.get(ref) or {}).get("tags")))}
         kind = kind_of({k: v for k, v in tags.items() if k != "type"})
@@ -505,7 +505,7 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
             if member.get("type") == "relation":
                 outline.broken.append(f"its member relation {member.get('ref')} was left out")
             continue
-        # Overpass contains the line of a member in the relation, whereas XML refers to it by its id
+        # in Overpass the relation contains the line of each member, but XML contains only the id of the line
         way = member if isinstance(member.get("geometry"), list) else data.ways.get(str(member.get("ref")))
         if way is None:
             outline.broken.append(f"way {member.get('ref')} is not in the file")
@@ -530,7 +530,7 @@ def _inside(ring: list[Position], shell: list[Position]) -> bool:
     shapes = [Polygon(line) for line in (ring, shell)]
     if any(not shape.is_valid and is_tangled(shape) for shape in shapes):
         return False
-    # a ring that crosses itself covers no area until it is repaired
+    # a ring that crosses itself must be repaired before its area can be used
     inner, outer = (shapely.make_valid(shape) for shape in shapes)
     return bool(inner.area < outer.area and shapely.covers(outer, inner))
 
@@ -549,7 +549,7 @@ def _join_rings(lines: list[list[Position]], outline: Outline) -> list[list[Posi
     rings, open_ = [], [list(line) for line in lines if len(line) > 1]
     while open_:
         ring = open_.pop()
-        # pieces may be in any order and direction
+        # the pieces of a ring may have any order and direction
         while ring[0] != ring[-1] and (index := _next_piece(ring, open_)) is not None:
             piece = open_.pop(index)
             if ring[-1] in (piece[0], piece[-1]):
@@ -569,7 +569,7 @@ def _next_piece(ring: list[Position], pieces: list[list[Position]]) -> int | Non
     return next((i for i, piece in enumerate(pieces) if ends & {piece[0], piece[-1]}), None)
 
 
-# Largest size of a map file. A map of a county is smaller, and a site needs a few kilometres.
+# Largest size of a map file. Even a map of a county is smaller, and a site needs only a few kilometres.
 MAX_BYTES = 256 * 1024 * 1024
 
 # Largest number of begin and end tags of an XML map file, because each becomes an object in memory.
@@ -577,7 +577,7 @@ MAX_TAGS = 1_500_000
 
 FORMATS = "GeoJSON, OSM XML, Overpass JSON, KML or KMZ"
 
-# Text that shows that GeoJSON or KML comes from OpenStreetMap: its name or its ids.
+# Text by which GeoJSON or KML from OpenStreetMap is recognised: the name or the form of the ids.
 _OF_OSM = re.compile(rb'openstreetmap|"osm_(way_)?id"|"(way|relation|node)/[0-9]+"', re.IGNORECASE)
 
 _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
@@ -654,7 +654,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         raise InputError("not JSON text: a byte that is not UTF-8", cause="save it as UTF-8", line=line) from None
     if isinstance(content, dict) and isinstance(content.get("elements"), list):
         result = read_elements("Overpass JSON", content["elements"], path)
-        # Overpass answers with status 200 and a remark if it ran out of time
+        # after a timeout, Overpass answers with status 200 and a remark
         if remark := content.get("remark"):
             result.notes.append(f"warning: {path.name}: the Overpass server reports: {str(remark)[:200]}")
         return result
@@ -692,7 +692,7 @@ def _check_crs(crs: Any) -> None:
     """Refuse coordinate systems other than WGS84, which GeoJSON from before RFC 7946 may name."""
     named = crs.get("properties") if isinstance(crs, dict) else crs
     name = str(named.get("name", "CRS84") if isinstance(named, dict) else named or "CRS84")
-    # 4979 is WGS84 with heights
+    # EPSG:4979 is WGS84 with heights
     if not any(code in name for code in ("CRS84", "4326", "4979")):
         raise InputError(
             f"coordinates in {name}",
@@ -826,7 +826,7 @@ _PLACEMARK_PARTS = {*_NO_AREAS, "Polygon", "Data", "SimpleData"}
 
 
 def _kml_height(polygons: list[ElementTree.Element], outline: Outline) -> None:
-    """Set the height of polygons drawn above the ground, if the data of the placemark have none."""
+    """Set the height from polygons drawn above the ground, if the data of the placemark contain no height."""
     modes = {mode for polygon in polygons for mode in kml.modes_of(polygon)}
     heights = (place[2] for polygon in polygons for place in kml.places_of(polygon) if place[2:])
     highest = max(filter(isfinite, heights), default=0.0)

@@ -1,8 +1,8 @@
 """Electrical properties of building materials and ground.
 
-Parametric model and constants of Recommendation ITU-R P.2040 (P.2040-4, table 3): with f in GHz,
-``eps' = a f^b`` and the conductivity ``sigma = c f^d`` [S/m]. The complex relative permittivity is
-``eps' - j sigma / (2 pi f eps0)`` for the time factor ``exp(+j omega t)``.
+Model and constants are from Recommendation ITU-R P.2040 (P.2040-4, table 3). With f in GHz, ``eps' = a f^b`` and the
+conductivity is ``sigma = c f^d`` [S/m]. The complex relative permittivity is ``eps' - j sigma / (2 pi f eps0)`` for the
+time factor ``exp(+j omega t)``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Material:
         low, high, *_ = self.band
         if low <= frequency_ghz <= high:
             return self.band
-        # suggest the constants at the nearest frequency in the table, as text to paste
+        # suggest the properties at the nearest frequency of the table, as text that a user can paste
         edge = low if frequency_ghz < low else high
         near = stated_name(self.relative_permittivity(edge * 1e9).real, self.conductivity_s_per_m(edge * 1e9), None)
         raise UsageError(
@@ -118,7 +118,7 @@ def material(name: str) -> Material:
     Raises
     ------
     UsageError
-        For an unknown name; the message contains the most similar one.
+        For an unknown name. The message contains the most similar name.
 
     Examples
     --------
@@ -134,7 +134,7 @@ def material(name: str) -> Material:
     plain, _, numbers = name.partition(" with ")
     if numbers:
         return _stated(plain, numbers, name)
-    # Sionna, Blender and users write one name in three ways
+    # Sionna, Blender and users write the same name in three ways
     key = name.strip().lower().replace("-", "_").replace(" ", "_").removeprefix("itu_")
     if key not in _TABLE:
         near = difflib.get_close_matches(key, _TABLE, n=1, cutoff=0.4)
@@ -149,7 +149,7 @@ def material(name: str) -> Material:
 
 def _stated(plain: str, numbers: str, name: str) -> Material:
     """Return a material whose name contains its numbers."""
-    # permittivity and conductivity of a material of the table follow from the carrier
+    # for a material of the table, permittivity and conductivity follow from the carrier
     allowed = {"thickness"} if plain != CONSTANT else {"thickness", "permittivity", "conductivity"}
     try:
         values = {key: float(value) for key, value in (word.split("=") for word in numbers.split())}

@@ -2,9 +2,9 @@
 
 Triangles and radio materials of a Mitsuba scene are read without Mitsuba.
 
-Supported are shapes of type ``ply`` in the coordinates of the scene, as in all scenes of Sionna RT and AERPAW, and the
-materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
-``itu_`` or ``mat-itu_``. A scene may name only files in its own folder.
+The reader supports shapes of type ``ply`` in the coordinates of the scene, as in all scenes of Sionna RT and AERPAW.
+Supported materials are ``itu-radio-material``, ``radio-material``, ``absorber-radio-material``, or any other type if
+the id begins with ``itu_`` or ``mat-itu_``. A scene may name only files in its own folder.
 
 Meshes are binary PLY files of triangles, as in all scenes of Sionna RT.
 """
@@ -57,7 +57,7 @@ def read_mesh(path: Path) -> tuple[Mesh, bytes]:
     Raises
     ------
     InputError
-        If it is not a mesh, is cut off, or a face names no vertex.
+        If the file is not a mesh or is truncated, or a face refers to a missing vertex.
     """
     data = read_input(path, _LARGEST_FILE, "a mesh")
     with parsing(path, "a mesh"):
@@ -70,7 +70,7 @@ def read_ply(data: bytes) -> Mesh:
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     for name, count, fields in elements:
         record = np.dtype(fields)
-        # compare before an array is made, because a damaged header may promise more than fits into memory
+        # check before an array is allocated, because a damaged header may state more entries than fit into memory
         if count < 0 or place + count * record.itemsize > len(data):
             raise InputError(
                 f"the file ends before the {count} entries of '{name}' that its header declares",
@@ -97,7 +97,7 @@ def _triangles(rows: AnyArray) -> IntArray:
 
 
 def _checked(vertices: FloatArray, triangles: IntArray) -> Mesh:
-    """Return the mesh if every index names a vertex and every used vertex is finite."""
+    """Return the mesh if every index refers to a vertex and every used vertex is finite."""
     wrong = triangles[(triangles < 0) | (triangles >= len(vertices))]
     if wrong.size:
         raise InputError(
@@ -108,12 +108,12 @@ def _checked(vertices: FloatArray, triangles: IntArray) -> Mesh:
     return vertices, triangles
 
 
-# Name, number of entries and fields of an element. A list has three items, after its length.
+# Name, number of entries and fields of an element. A list consists of its length and three items.
 _Element = tuple[str, int, list[Any]]
 
 
 def _header(data: bytes) -> tuple[list[_Element], int]:
-    """Return the elements of a PLY file, and where the first of them begins."""
+    """Return the elements of a PLY file, and the position of the first byte after the header."""
     if not data.startswith(b"ply"):
         raise InputError("it does not begin with 'ply'", expected="a PLY mesh")
     end = data.find(b"end_header", 0, _LARGEST_HEADER)
@@ -230,7 +230,8 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
             continue
         name = shape.get("id") or f"shape {len(parts) + 1}"
         mesh, content = read_mesh(_file_of(shape, name, path))
-        # combine digests, so that moving bytes from one file to the next changes the result
+        # combine the digests of files, because a digest of their joined bytes would not notice bytes moved between
+        # files
         digest.update(hashlib.sha256(content).digest())
         parts.append(_Part(name, _of_shape(shape, name, radio, unknown), mesh))
         if sum(len(part.mesh[1]) for part in parts) > _MOST_TRIANGLES:
@@ -313,7 +314,7 @@ def _radio_material(bsdf: ElementTree.Element, name: str) -> str | None:
     thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M)
     stated = bsdf.find("string[@name='type']")
     if kind == "itu-radio-material" or plain.startswith(("itu_", "itu-")):
-        # the exporter of Blender uses such names, from which Sionna RT derives the type
+        # Blender's exporter uses these prefixes, and Sionna RT derives the type of material from them
         itu = plain[4:] if plain.startswith(("itu_", "itu-")) else plain
         if stated is not None:
             itu = stated.get("value", "")
@@ -357,7 +358,7 @@ def _of_shape(shape: ElementTree.Element, name: str, radio: Mapping[str, str], u
     # a shape may also refer to media and emitters
     refs = [item.get("id", "") for item in shape.findall("ref") if item.get("name", "bsdf") == "bsdf"]
     which = inner.get("id", "") if inner is not None else (refs[0] if refs else "")
-    # check before its material, because leaves often have a material without radio properties
+    # check the name before the material, because leaves often have a material without radio properties
     if _VEGETATION.search(f"{name} {which}".lower()):
         return CROWN
     if which in radio:
@@ -378,7 +379,7 @@ def _of_shape(shape: ElementTree.Element, name: str, radio: Mapping[str, str], u
 
 
 def _file_of(shape: ElementTree.Element, name: str, path: Path) -> Path:
-    """Return the mesh file of a shape, which is in the folder of the scene."""
+    """Return the mesh file of a shape. It must be in the folder of the scene."""
     # exporters write empty transforms, which have no effect
     if len(shape.find("transform[@name='to_world']") or ()):
         raise InputError(

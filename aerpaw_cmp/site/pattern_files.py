@@ -1,4 +1,4 @@
-"""Antenna files of all kinds, recognised by content: measured spheres, one great circle, cuts of planning tools.
+"""Antenna files, recognised by content: measured spheres, a single great circle, cuts of planning tools.
 
 The formats for writing are the custom pattern of Sionna RT, cuts of MSI Planet, and a table over the sphere.
 
@@ -26,13 +26,14 @@ from .learned import BAND, SPHERE_COLUMNS, planning_cuts, read_sphere_csv, spher
 _DBI_OF_DBD = 2.15
 STEP_DEG = 3.0
 
-# Values of a cut may exceed the peak by this, and the peak may differ from both cuts by this [dB].
+# Largest accepted excess of a cut above the stated peak, and of a stated peak above both cuts [dB].
 _RIPPLE_DB = 1.0
 
 # Largest mean gain over the sphere of a pattern from two cuts [dB]: 0.5 dB for the measurement, 0.5 dB for the
 # interpolation, which changed the mean of ten sector antennas and arrays by -0.3 to +0.2 dB.
 _MOST_OF_CUTS_DB = 1.0
-# Limit for a learned antenna, whose level is not known. Cuts through its only lobe added 3.7 dB.
+# Limit for a learned antenna, whose level is not known. For cuts through the only lobe of such an antenna,
+# interpolation added 3.7 dB.
 _MOST_OF_LEARNED_CUTS_DB = 5.0
 _PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
 _GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
@@ -82,7 +83,7 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
 def _planet(text: str, name: str) -> MeasuredPattern:
     """Return the pattern of an MSI Planet file.
 
-    Cuts run clockwise from the front, and from the front downwards.
+    Angles of the horizontal cut are clockwise from the front. Angles of the vertical cut are downwards from the front.
 
     Raises
     ------
@@ -92,11 +93,11 @@ def _planet(text: str, name: str) -> MeasuredPattern:
     gain = _GAIN.search(text)
     if gain is None:
         raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd")
-    # dBd is the default of MSI Planet
+    # MSI Planet uses dBd if no unit is stated
     peak_dbi = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else _DBI_OF_DBD)
     cuts: dict[str, FloatArray] = {}
     for cut in _PLANET.finditer(text):
-        # the header has the number of lines, and later lines belong to the next cut
+        # the header states the number of lines; later lines belong to the next cut
         rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]))
         cuts[cut[1].upper()] = _each_degree(rows, cut[1])
     carrier, learned = _FREQUENCY.search(text), bool(trained_on(text))
@@ -116,7 +117,7 @@ def _planet(text: str, name: str) -> MeasuredPattern:
 def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float) -> dict[str, FloatArray]:
     """Return the gain of cuts that contain attenuations below the peak, all positive or all negative [dBi]."""
     values = np.concatenate(list(cuts.values()))
-    # attenuations have one sign; values of both signs are gains relative to a level
+    # attenuations all have the same sign; values with both signs are gains relative to a level
     if min(-values.min(), values.max()) > _RIPPLE_DB:
         raise InputError(
             f"values from {values.min():g} to {values.max():g} dB below the peak",
@@ -154,10 +155,10 @@ def _each_degree(rows: FloatArray, cut: str) -> FloatArray:
     angle, value = rows[:, 0] % 360.0, rows[:, 1]
     if not np.isfinite(rows).all() or np.abs(value).max() > 10 * HIGHEST_DBI:
         raise InputError(f"cut {cut} reaches {np.abs(value).max():g} dB", expected="attenuation in dB")
-    if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # a front half is used for the back, too
+    if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # use a front half for the back, too
         angle, value = np.concatenate((angle, (180.0 - rows[:, 0]) % 360.0)), np.concatenate((value, value))
     order = np.argsort(angle, kind="stable")
-    # include the gap across the front
+    # include the gap between the last and the first angle
     if np.diff(np.append(angle[order], angle[order][0] + 360.0)).max() > 15.0:
         raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle")
     return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
@@ -179,11 +180,11 @@ def _from_cuts(
     horizontal, vertical = cuts["HORIZONTAL"], cuts["VERTICAL"]
     theta, around, _ = sphere_grid(STEP_DEG)
     below = theta - 90.0
-    # share of the back, by which the front of the vertical cut is weighted against its back
+    # weight of the back of the vertical cut
     share = np.minimum(around, 360.0 - around) / 180.0  # 0 in front, 1 behind
-    # planning tools count clockwise, and azimuth is counter-clockwise here
+    # angles of planning tools are clockwise, but azimuth is counter-clockwise
     level = _at(horizontal, -around)[None, :] + (1.0 - share)[None, :] * (_at(vertical, below) - horizontal[0])[:, None]
-    # a vertical cut with equal front and back does not contain the back, whose level comes from the horizontal cut
+    # if front and back of the vertical cut are equal, only its front was measured, so the back is relative to the front
     same = np.allclose(vertical, vertical[(180 - np.arange(360)) % 360], atol=1e-6)
     behind = horizontal[0 if same else 180]
     level = level + share[None, :] * (_at(vertical, 180.0 - below) - behind)[:, None]
@@ -213,7 +214,7 @@ def _pattern(
 
 
 def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPattern:
-    """Return the pattern of an AERPAW file of total gain along one great circle. Both halves are blended."""
+    """Return the pattern of an AERPAW file of total gain along one great circle. Other directions are interpolated."""
     rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d{6,}(?:\.\d+)?\s", line)]
     table = np.array([[float(cell) for cell in row[:3]] for row in rows if len(row) >= 3])
     if not len(table):
@@ -235,7 +236,7 @@ def _great_circle(text: str, name: str, carrier_hz: float | None) -> MeasuredPat
     # blend the two halves of the circle around the axis, because there are no values between them
     front, back = (np.interp(side * np.radians(theta), angle, gain) for side in (1.0, -1.0))
     level = (1.0 - share) * front[:, None] + share * back[:, None]
-    # one circle leaves more of the sphere to the interpolation than two cuts
+    # from one circle, more of the sphere is interpolated than from two cuts
     return _pattern(level, name, frequency, _MOST_OF_LEARNED_CUTS_DB)
 
 

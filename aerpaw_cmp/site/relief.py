@@ -1,6 +1,6 @@
 """Ground heights: digital elevation models, and a smooth surface through points.
 
-A digital elevation model provides ground heights, profiles below straight lines, and a check which lines the ground
+A digital elevation model provides ground heights and profiles below straight lines, and shows which lines the ground
 blocks.
 
 Reflections from this ground are in :mod:`aerpaw_cmp.propagation.search.terrain`.
@@ -33,7 +33,7 @@ from ..common.text import counted
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 
 EARTH_RADIUS_M = 6_371_000.0
-# Range of ground heights on Earth. Other values are undeclared gaps or other units.
+# Range of ground heights on Earth. Values outside it are undeclared gaps or have other units.
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
 
 MAX_BYTES = 512 * 1024 * 1024
@@ -59,11 +59,12 @@ class FilledPatch:
     jump_m: float
 
 
-# A patch of equal height is suspicious from this number of cells (one cell at exactly 0 m) ...
+# A patch of equal height is suspicious if it has at least this number of cells (one cell at exactly 0 m) ...
 _FILLED_CELLS = 4
-# ... if the ground around it differs by more than this [m], unlike four cells of a slope in whole metres.
+# ... and the ground around it differs by more than this [m]. Equal cells on a slope rounded to whole metres differ
+# less.
 _FILLED_JUMP_M = 20.0
-# Cells on each side of a position in which its patch is searched.
+# Number of cells on each side of a position in which a patch is searched.
 _WINDOW_CELLS = 300
 
 
@@ -101,7 +102,7 @@ class Dem:
             from pyproj.exceptions import CRSError
 
             try:
-                # a crs in degrees would otherwise have latitude first
+                # without always_xy, a crs in degrees would have latitude first
                 transformer = Transformer.from_crs("EPSG:4326", self.crs, always_xy=True)
             except CRSError:
                 raise UsageError(f"unknown crs '{self.crs}'", expected="such as EPSG:4326 or EPSG:26917") from None
@@ -114,7 +115,7 @@ class Dem:
                     expected=f"coordinates of {self.crs}",
                     cause="they are metres or feet: another crs",
                 )
-        # up is measured from the ground at the origin, independent of the datum of the grid
+        # up is measured from the ground at the origin, so it does not depend on the datum of the grid
         object.__setattr__(self, "_origin_m", float(self.absolute_m(0.0, 0.0)))
         if np.isnan(self._origin_m):
             column, row = self._cell(0.0, 0.0)
@@ -142,12 +143,12 @@ class Dem:
         column, row = self._cell(east_m, north_m)
         inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
         column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
-        # the last row is the far end of the cell before it, because it has no further neighbour
+        # the last row has no next neighbour, so use it as the far side of the cell before it
         i = np.minimum(row.astype(np.int64), max(rows - 2, 0))
         j = np.minimum(column.astype(np.int64), max(columns - 2, 0))
         u, v = row - i, column - j
         h = self.height_m
-        # use differences, so that level ground is level to the last digit
+        # with differences, level ground is level to the last digit
         south = h[i, j] + v * (h[i, j + 1] - h[i, j])
         north = h[i + 1, j] + v * (h[i + 1, j + 1] - h[i + 1, j])
         return np.where(inside, south + u * (north - south), np.nan)
@@ -165,7 +166,7 @@ class Dem:
         if not (0 <= row < rows and 0 <= column < columns):
             return None
         height = float(self.height_m[row, column])
-        # a window limits the work on large grids; only a patch that fills the window needs the complete grid
+        # search a window first to save time on large grids; only a patch that fills it needs the complete grid
         for reach in (_WINDOW_CELLS, max(rows, columns)):
             top, left = max(row - reach, 0), max(column - reach, 0)
             window = self.height_m[top : row + reach + 1, left : column + reach + 1]
@@ -203,7 +204,7 @@ class Dem:
         some : (k,) int
             Indices of lines of similar length.
         share : (samples, k)
-            Share of the way from source to target, with 0 and 1; shorter lines repeat their last sample.
+            Share of the way from source to target, including 0 and 1. Shorter lines repeat their last sample.
         ground_m : (samples, k)
             Height of the ground; NaN if it is unknown.
         """
@@ -217,7 +218,7 @@ class Dem:
             while stop < len(order) and count[order[stop]] * (stop + 1 - begin) <= _SAMPLES_AT_ONCE:
                 stop += 1
             some = order[begin:stop]
-            # samples of a line do not depend on its batch
+            # the samples of a line must not depend on its batch
             share = np.minimum(np.arange(count[some].max() + 1)[:, None], count[some]) / count[some]
             place = source_m[some, :2] + share[..., None] * way[some]
             yield some, share, self.ground_m(place[..., 0], place[..., 1])
@@ -243,7 +244,7 @@ class Dem:
         tolerance, free = np.broadcast_to(tolerance_m, len(source)), np.ones(len(source), dtype=bool)
         for some, share, ground in self.profiles(source, target):
             start, way = source[some], target[some] - source[some]
-            # height of the curved Earth above the chord, because up is measured from a plane
+            # add the height of the curved Earth above the chord, because up is measured from a plane
             bulge = share * (1 - share) * np.hypot(*way[:, :2].T) ** 2 / (2 * EARTH_RADIUS_M)
             intrusion = ground + bulge - (start[:, 2] + share * way[:, 2])
             # ignore both ends, because the mean height of a cell may be above the foot of an antenna in it
@@ -271,7 +272,7 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
     frame : SiteFrame
         Frame of the site.
     crs : str, optional
-        Required for ASCII grids, which do not name one; ``local`` means metres of the site frame.
+        Coordinate system, which ASCII grids do not contain. ``local`` means metres of the site frame.
 
     Returns
     -------
@@ -282,7 +283,7 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
     InputError
         If the file has another format, or does not contain the site.
     UsageError
-        If an ASCII grid has no crs, or rasterio is missing for a GeoTIFF.
+        If ``crs`` is missing for an ASCII grid, or rasterio for a GeoTIFF.
     """
     path = Path(path)
     data = read_input(path, MAX_BYTES, "an elevation model")
@@ -313,7 +314,7 @@ def _read_ascii(data: bytes, frame: SiteFrame, crs: str) -> Dem:
             cause="the file was cut off" if flat.size < rows * columns else "nrows or ncols is wrong",
             line=len(lines),
         )
-    # heights belong to cell centres, half a cell from a corner
+    # heights are at cell centres, half a cell from the corner
     west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
     south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
     return Dem(
@@ -353,7 +354,7 @@ def _ascii_cells(line: str, gap: float, number: int) -> FloatArray:
 
 
 def _plausible(height_m: FloatArray, line: int | None = None) -> FloatArray:
-    """Return the heights if each is a gap or possible on Earth."""
+    """Return the heights if each is a gap or a possible height on Earth."""
     wrong = height_m[(height_m < LOWEST_M) | (height_m > HIGHEST_M)]
     if wrong.size:
         raise InputError(
@@ -388,19 +389,19 @@ def _read_geotiff(data: bytes, frame: SiteFrame) -> Dem:
     )  # fmt: skip
 
 
-# Cell size of a surface as an elevation model [m], and the largest number of cells.
+# Cell size of an elevation model computed from a surface [m], and its largest number of cells.
 _CELL_M, _MOST_CELLS = 25.0, 40_000
 
 # Candidate lengths and standard deviations [m].
 _LENGTHS_M = np.geomspace(30.0, 2000.0, 9)
-# Both have steps of about 65 %.
+# Both sequences have steps of about 65 %.
 _DEVIATIONS_M = np.geomspace(1.0, 50.0, 9)
 
-# Heights at positions this close belong to one position. They contradict each other if they differ by more than this
-# number of standard deviations.
+# Heights at positions within this distance [m] count as heights of one position. They contradict each other if they
+# differ by more than this number of standard deviations.
 _SAME_PLACE_M, _CONTRADICTION = 1.0, 4.0
 
-# Number of waves in a drawn surface.
+# Number of waves in a random surface.
 _WAVES = 500
 
 
@@ -451,11 +452,11 @@ class Surface:
         for drawn in draws:
             off = self.height_m - self.level_m
             prior = np.zeros(len(place))
-            # correct a draw of the process at the points, which needs one solve and no factor of the complete grid
+            # correct a draw of the process at the points, which avoids a factorisation of the complete grid
             if drawn is not None:
                 waves = self._waves(drawn)
                 prior = waves.on_grid(across, along).ravel()
-                # heights of points have errors, which are drawn for each surface
+                # the heights of points have errors, so draw errors for each surface
                 off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
             height = self.level_m + prior + near @ factor.solve(off)
             yield Dem(
@@ -467,7 +468,7 @@ class Surface:
         """Return the standard deviation of the surface, shape (places,) [m]."""
         near = self._between(np.column_stack([east_m, north_m]))
         known = (self._factor().whiten(near.T) ** 2).sum(axis=0)
-        # rounding errors at a point can be negative
+        # at a point, rounding errors can make the variance negative
         return np.asarray(np.sqrt(np.maximum(self.deviation_m**2 - known, 0.0)))
 
     def _between(self, place_m: FloatArray) -> FloatArray:
@@ -486,7 +487,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class _Waves:
-    """A sum of cosines of equal height [m] with wave vectors (2, waves) [rad/m] and phases (waves,)."""
+    """A sum of cosines of equal amplitude [m] with wave vectors (2, waves) [rad/m] and phases (waves,)."""
 
     vector: FloatArray
     phase: FloatArray
@@ -496,7 +497,7 @@ class _Waves:
         return np.asarray(self.height_m * np.cos(place_m @ self.vector + self.phase).sum(axis=1))
 
     def on_grid(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Return the sum on a grid (north, east), from the cosines and sines of rows and columns by cos(a + b)."""
+        """Return the sum on a grid (north, east), computed from rows and columns by the formula for cos(a + b)."""
         east, north = east_m[:, None] * self.vector[0], north_m[:, None] * self.vector[1] + self.phase
         return np.asarray(self.height_m * (np.cos(north) @ np.cos(east).T - np.sin(north) @ np.sin(east).T))
 
@@ -546,7 +547,7 @@ def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float
 
 @lru_cache(maxsize=8)
 def _likeliest(points: bytes) -> tuple[float, float, float]:
-    """Return length, deviation and mean of the process of points [m], cached for all stages of a report."""
+    """Return length, deviation and mean of the process through points [m], cached for all stages of a report."""
     rows = np.frombuffer(points).reshape(-1, 4)
     place, height, error = rows[:, :2], rows[:, 2], rows[:, 3]
     apart = cdist(place, place)

@@ -1,8 +1,8 @@
 """The site as triangles, one mesh per material, and scenes of triangles in the site frame.
 
-Walls begin below the ground and prisms have no bottom face, so that no two triangles are in one plane by accident. All
-outward normals follow the right-hand rule. The image engine of the replay uses the faces of the site; meshes are for
-ray tracers, pictures and other programs.
+Walls begin below the ground and prisms have no bottom face, because two faces in the same plane would disturb ray
+tracers. All outward normals follow the right-hand rule. Meshes are for ray tracers, pictures and other programs. The
+image engine of the replay uses the faces of the site instead.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def building_mesh(building: Building) -> Mesh:
     roof = np.stack([np.asarray(part.exterior.coords)[:3, :2] for part in parts])
     flat = roof.reshape(-1, 2)
     edge, other_edge = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
-    # the triangulation has no defined direction, but the normal of a roof must point up
+    # the triangulation may have either direction, but the normal of a roof must point up
     turn = edge[:, 0] * other_edge[:, 1] < edge[:, 1] * other_edge[:, 0]
     order = np.arange(len(flat)).reshape(-1, 3)
     order[turn] = order[turn][:, ::-1]
@@ -99,7 +99,7 @@ def site_meshes(site: Site) -> dict[str, Mesh]:
     return {name: joined(parts) for name, parts in pieces.items()}
 
 
-# Distance by which an added ground plane extends beyond the scene, in sizes of the scene.
+# Distance by which an added ground plane extends beyond the scene, as a multiple of the size of the scene.
 _PLANE_MARGIN = 10.0
 
 # A scene has no ground if its horizontal surfaces cover a smaller share of its plan than this.
@@ -125,7 +125,7 @@ def placed_scene(
     path : Path
         XML file.
     materials : mapping of str to str, optional
-        The same as in :func:`aerpaw_cmp.site.mitsuba.read_scene`.
+        As in :func:`aerpaw_cmp.site.mitsuba.read_scene`.
     sha256 : str, optional
         Required digest of the files of the scene.
     offset_m : (east, north, up)
@@ -143,7 +143,7 @@ def placed_scene(
     Raises
     ------
     UsageError
-        If the files are not those of ``sha256``.
+        If the digest of the files is not ``sha256``.
     """
     scene = read_scene(path, materials)
     if sha256 is not None and sha256 != scene.sha256:
@@ -161,7 +161,7 @@ def placed_scene(
 
 
 def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
-    """Return the scene on a horizontal rectangle at its lowest point, which extends far beyond it."""
+    """Add a horizontal rectangle at the lowest point of the scene, which extends far beyond the scene."""
     low, high = bounds(scene)
     # extend it so far that no reflection between points of the scene misses it
     reach = _PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
@@ -216,14 +216,15 @@ def ground_share(scene: TriangleScene) -> float:
     return float(shapely.union_all(shapely.polygons(level[:, :, :2])).area / (high - low)[:2].prod())
 
 
-# A mesh this narrow in plan, and this close to an antenna, is its mast, bracket or housing.
+# A mesh that is narrower than the first length in plan, and closer than the second to an antenna, is its mast, bracket
+# or housing.
 _MAST_M, _TOUCHES_M = 4.0, 0.5
 
 
 def without_traps(
     scene: TriangleScene, antennas_m: Mapping[str, FloatArray]
 ) -> tuple[TriangleScene, tuple[Forest, ...], list[str]]:
-    """Remove meshes that are not mirrors or would enclose an antenna.
+    """Remove meshes of vegetation, and meshes that would enclose an antenna.
 
     Parameters
     ----------
@@ -236,8 +237,8 @@ def without_traps(
     TriangleScene
         Scene without vegetation, and without meshes around or below an antenna.
     tuple of Forest
-        Each part of a mesh of vegetation as a medium: its outline from above, from its lowest to its highest corner,
-        filled according to its volume. Trunks are removed.
+        The parts of meshes of vegetation as media. A medium has the outline of its part from above, extends from the
+        lowest to the highest corner, and is filled according to the volume. Trunks are removed.
     list of str
         List of actions.
     """
@@ -259,7 +260,7 @@ def without_traps(
                     "reflect"
                 )
     green = np.array([name == CROWN for name in scene.materials])
-    # trunks shade only centimetres, and their convex outline would be a wood
+    # omit trunks, because they shade only centimetres, but their convex outline would be a wood
     trunk = green & np.array(["trunk" in name.lower() for name in scene.shapes])
     woods = [wood for number in np.flatnonzero(green & ~trunk).tolist() for wood in _media(scene, number)]
     if green.any():
@@ -272,13 +273,13 @@ def without_traps(
 
 
 def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
-    """Check whether a point is inside a mesh (n, 3, 3): upward lines from it cross an odd number of triangles."""
+    """Check whether a point is inside a mesh (n, 3, 3): upward lines from it then cross an odd number of triangles."""
     across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    # the area vectors of a closed mesh add up to zero
+    # only the area vectors of a closed mesh add up to zero
     if np.linalg.norm(across.sum(axis=0)) > 1e-3 * np.linalg.norm(across, axis=1).sum():
         return False  # an open mesh, such as terrain
     votes = 0
-    # use three lines: if one of them meets an edge, the others do not
+    # use three lines and the majority, because a single line may meet an edge
     for shift in ((1e-4, 2e-4), (-3e-4, 1e-4), (2e-4, -3e-4)):
         a, b, c = (corners_m[:, k] - place_m - np.array([*shift, 0.0]) for k in range(3))
         turns = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))])
@@ -340,7 +341,7 @@ def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
     low, high = bounds(scene)
     ground_m2 = float((high[0] - low[0]) * (high[1] - low[1]))
     outlines: list[tuple[str, Polygon, float]] = []
-    from_above = area > 1e-3  # walls are lines from above
+    from_above = area > 1e-3  # walls have no area from above
     for shape in np.unique(scene.shape[from_above]).tolist():
         rows = np.flatnonzero(from_above & (scene.shape == shape))
         parts = shapely.get_parts(shapely.union_all(shapely.buffer(plan[rows], 0.01, join_style="mitre")))
@@ -350,9 +351,9 @@ def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
             simple = outline.simplify(_DRAWN_SIMPLER_M)
             if mine.size and simple.geom_type == "Polygon" and _DRAWN_M2 < simple.area < _GROUND_PART * ground_m2:
                 outlines.append((scene.shapes[shape], simple, float(mine.max())))
-    # keep only the largest, because a browser cannot draw 100 000 prisms
+    # keep only the largest outlines, because a browser cannot draw 100 000 prisms
     outlines = sorted(outlines, key=lambda drawn: -drawn[1].area)[:_DRAWN_MOST]
-    # extend to the lowest corner of anything below, because roofs are often separate shapes
+    # extend each prism down to the lowest corner below it, because roofs are often separate shapes
     feet = np.array([top for *_, top in outlines])
     boxes = shapely.buffer([outline for _, outline, _ in outlines], 0.5)
     box, corner = shapely.STRtree(shapely.points(scene.vertices_m[:, :2])).query(boxes, predicate="contains")

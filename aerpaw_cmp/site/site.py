@@ -18,13 +18,13 @@ from ..common.units import FloatArray
 from .mitsuba import TriangleScene
 from .relief import Dem
 
-# No tower has this name: it is that of the nearest tower in layers of maps, such as rank_k10_h030m_joint_opaque.
+# Name for the nearest tower in layers of maps, such as rank_k10_h030m_joint_opaque. No tower may have this name.
 NEAREST = "joint"
 
 
 @dataclass(frozen=True, slots=True)
 class Tower:
-    """A fixed node, which is a tower of the testbed.
+    """A tower of the testbed, which is a fixed node.
 
     Parameters
     ----------
@@ -73,14 +73,15 @@ class Building:
 class Forest:
     """A wooded area (east, north) [m].
 
-    Without a height it contains single trees at random positions. With a height it is one medium, a forest stand.
+    A forest without a height contains single trees at random positions. A forest with a height is a medium (forest
+    stand).
 
     Parameters
     ----------
     name : str
     area : Polygon
     trees_per_hectare, minimum_spacing_m : float
-        Density and minimum distance of the trees that are placed.
+        Density and minimum distance of the single trees.
     source : str
     height_m : float, optional
         Height of the canopy above the ground.
@@ -153,7 +154,7 @@ class Site:
     frame : SiteFrame
         Frame with the position of the origin.
     towers : mapping of str to Tower
-        Towers in drawing order.
+        Towers in the order in which they are drawn.
     buildings, forests, geofences : tuples
         Objects of the site, which may be empty.
     trees : Trees
@@ -165,9 +166,9 @@ class Site:
     area_m : (east_min, east_max, north_min, north_max)
         Extent for maps.
     credit : str
-        Source of the map, which is shown wherever buildings and forests are drawn.
+        Source of the map. It is shown wherever buildings and forests are drawn.
     assumed : str
-        Sizes on the map that are assumed.
+        Sentence about sizes that the map does not state and that are assumed.
     notes : tuple of str
         Remarks for the report.
     disagreements : tuple of str
@@ -208,14 +209,14 @@ class Site:
 
     @property
     def mapped(self) -> bool:
-        """True if the site comes from a map, so that an area without objects is known to be empty."""
+        """True if the site comes from a map, which shows that an area without objects is empty."""
         return bool(self.forests or self.buildings or len(self.trees) or self.scene is not None)
 
     def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Return the height of the ground, shape (n,) [m].
 
-        This is the height of the terrain if it is known. Otherwise it is the ground height of the nearest tower, or in
-        a scene that of the take-off point.
+        This is the height of the terrain if it is known. Otherwise it is the ground height of the nearest tower or, in
+        a scene of triangles, of the take-off point.
 
         A ground height of a tower above 0 is taken as 0, because the ground between towers is lower and a UAV may be
         there.

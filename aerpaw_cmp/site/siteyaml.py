@@ -2,7 +2,7 @@
 
 docs/site.md describes every key. Polygons are ``polygon_m`` (east, north) or ``polygon_deg`` (latitude, longitude).
 
-The files of a site are site.yaml and the files that it names. Outputs never replace them, and reports name each.
+The files of a site are site.yaml and the files that it names. Outputs never replace these files, and reports list them.
 
 Trees are those of the paper (arXiv 2502.10324, section V): a trunk cylinder below a cone of vegetation, 20 m high and
 10 m wide, at random positions in forests. The paper does not print the height of the base of the crown, which is
@@ -57,7 +57,7 @@ _MAPPED_M = 500.0
 # Smallest distance of random trees from a tower, because there are no trees around masts.
 MAST_CLEARANCE_M = 8.0
 
-# A building or mast above this is in feet or centimetres, because no structure on Earth is so high.
+# Largest height of a building or mast. No structure on Earth is higher, so a larger value is in feet or centimetres.
 TALLEST_M = 1000.0
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
@@ -106,7 +106,7 @@ _MAXIMUM_TREES = 2_000_000
 _STALLED_ROUNDS = 12  # consecutive batches that add less than a thousandth, after which the forest is full
 
 
-# Larger than the tallest, widest and thickest trees on Earth [m], so larger sizes are feet or centimetres.
+# Larger than the tallest, widest and thickest trees on Earth [m]. Larger values are in feet or centimetres.
 TALLEST_TREE_M = 120.0
 WIDEST_CROWN_M = 90.0
 THICKEST_TRUNK_M = 15.0
@@ -117,7 +117,7 @@ TrunkDiameter = Annotated[float, Field(gt=0, le=THICKEST_TRUNK_M)]
 
 
 class TreeSizes(StrictModel):
-    """The sizes of trees. The base of the crown is at a share of the height."""
+    """The sizes of trees. The height of the base of the crown is a share of the height of the tree."""
 
     height_m: TreeHeight = 20.0
     crown_diameter_m: CrownDiameter = 10.0
@@ -148,7 +148,7 @@ class OriginModel(StrictModel):
 
 
 class PositionModel(StrictModel):
-    """One published position of a tower."""
+    """A published position of a tower."""
 
     latitude_deg: Latitude
     longitude_deg: Longitude
@@ -157,7 +157,7 @@ class PositionModel(StrictModel):
 
 
 class TowerModel(StrictModel):
-    """A tower, with one position or several published ones."""
+    """A tower with one position, or with several published positions."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
@@ -201,7 +201,7 @@ class PolygonModel(StrictModel):
             shape = Polygon(_ring_from_degrees(self.polygon_deg or [], frame, self.name))
         if problem := _problem(shape):
             raise UsageError(f"the polygon of '{self.name}' {problem}")
-        # use one order of corners, so that equal outlines have equal names of walls
+        # sort the corners, so that walls have the same names if outlines are equal
         return shapely.normalize(shape)
 
 
@@ -215,7 +215,7 @@ class BuildingModel(PolygonModel):
 
 
 class ForestModel(PolygonModel):
-    """A wooded area. With a height it is a medium, which also has single trees if ``trees`` is true."""
+    """A wooded area. If it has a height, it is a medium, which also has single trees if ``trees`` is true."""
 
     trees_per_hectare: _NotNegative = 100.0
     minimum_spacing_m: _NotNegative = 4.0
@@ -229,7 +229,7 @@ OutlineT = TypeVar("OutlineT", bound=PolygonModel)
 
 
 class SingleTreeModel(StrictModel):
-    """A tree with its own sizes. Missing sizes are those of all trees."""
+    """A tree with its own sizes. For missing sizes, the sizes of all trees are used."""
 
     at_m: tuple[float, float]
     height_m: TreeHeight | None = None
@@ -264,7 +264,7 @@ class SceneModel(StrictModel):
 
 
 class CoverageModel(StrictModel):
-    """Carrier and link budget of maps and of predictions before any flight. The commands have an option for each."""
+    """Carrier and link budget of maps, and of predictions before any flight. Options of the commands override them."""
 
     carrier_ghz: Annotated[float, Field(ge=0.1, le=100)] | None = None
     tx_power_dbm: float | None = None
@@ -309,7 +309,8 @@ def load_site(name_or_path: str | Path, *, coordinates: str | None = None, tower
     tower_ground : {"flat", "offsets", "surface", "dem"}, optional
         ``flat`` sets the ground to up = 0 everywhere (the paper). ``offsets`` uses the stated height of each tower.
         ``surface`` puts towers, buildings and trees on a smooth surface through ``ground_points``, and ``dem`` on the
-        elevation model. Overrides the file, whose default is ``dem`` if it has one, and ``flat`` otherwise.
+        elevation model. This argument overrides the file. Its default is ``dem`` if it names an elevation model, and
+        ``flat`` otherwise.
 
     Returns
     -------
@@ -355,7 +356,7 @@ class _PlacedError(UsageError):
 
 @contextmanager
 def _at(*location: Any) -> Iterator[None]:
-    """Attach this key to errors raised in the block, unless they name a file or a nearer key."""
+    """Attach this key to errors raised in the block, unless they already name a file or a key."""
     try:
         yield
     except UsageError as error:
@@ -365,7 +366,7 @@ def _at(*location: Any) -> Iterator[None]:
 
 
 def known_grounds(name_or_path: str | Path) -> tuple[Ground, ...]:
-    """Return the values of ``tower_ground`` for which a site has data."""
+    """Return the values of ``tower_ground`` for which the site has data."""
     model = site_model(name_or_path)
     offsets = any(tower.ground_offset_m for tower in model.towers.values())
     has_data = {"flat": True, "offsets": offsets, "surface": bool(model.ground_points), "dem": model.dem is not None}
@@ -515,7 +516,7 @@ def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[s
 
 
 def extent_m(model: SiteModel, frame: SiteFrame) -> Area:
-    """Return the area of maps of the site: ``area_m``, or 500 m around the towers."""
+    """Return the area for maps of the site: ``area_m``, or 500 m around the towers."""
     return _checked_area(model.area_m, *_tower_places(model, frame).tolist())
 
 
@@ -603,7 +604,7 @@ def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
 
 
 def misread(latitude: Any, longitude: Any) -> dict[str, tuple[Any, Any]]:
-    """Return what a wrong position can have meant by its likely error, the most frequent error first."""
+    """Return corrected positions by the likely error of a wrong position, beginning with the most frequent error."""
     return {
         "latitude and longitude are swapped": (longitude, latitude),
         "the sign of the longitude is wrong: west is negative": (latitude, -longitude),
@@ -615,7 +616,7 @@ def misread(latitude: Any, longitude: Any) -> dict[str, tuple[Any, Any]]:
 def why_far(latitude: float, longitude: float, frame: SiteFrame) -> str:
     """Return the likely error of a position that is far from the site."""
     for cause, position in misread(latitude, longitude).items():
-        # a latitude can become invalid when both are swapped
+        # after a swap, the latitude can be invalid
         if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= _FAR_TOWER_M:
             return cause
     return "a digit is wrong, or it belongs to another site"
@@ -638,7 +639,7 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
 
 
 def _check_name(name: str, others: Iterable[str]) -> None:
-    """Refuse a name that a map reserves, or that its files could not distinguish from another tower's."""
+    """Refuse a name that maps reserve, or that is equal to the name of another tower in file names."""
     in_files = re.sub(r"\W", "_", name)
     if name == NEAREST:
         raise UsageError(f"a tower named '{name}'", expected="another name", cause="maps reserve this name")
@@ -652,7 +653,7 @@ def _check_name(name: str, others: Iterable[str]) -> None:
 
 def _unmapped(towers: Mapping[str, Tower], shapes: list[Polygon]) -> list[str]:
     """Return warnings about towers without any object of the map nearby, where the ground is unknown."""
-    # the nearest shape, because a union of all shapes of a town takes seconds
+    # use distances to all shapes, because a union of all shapes of a town takes seconds
     away = {t.name: shapely.distance(shapes, Point(t.east_m, t.north_m)) for t in towers.values()}
     bare = [name for name, distances in away.items() if shapes and distances.min() > _MAPPED_M]
     if not bare:
@@ -691,7 +692,7 @@ def _chosen_position(
 ) -> PositionModel:
     if model.latitude_deg is not None and model.longitude_deg is not None:
         return PositionModel(latitude_deg=model.latitude_deg, longitude_deg=model.longitude_deg, source=model.source)
-    # the first one in the file is the one that its author trusts
+    # use the first position in the file, which should be the most accurate
     key = next(iter(model.positions)) if source_name is None else source_name
     if key not in model.positions:
         raise UsageError(f"tower '{name}' has no position '{key}'", expected="one of " + ", ".join(model.positions))
@@ -707,7 +708,7 @@ def _chosen_position(
 
 def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Building:
     base = model.base_m
-    if dem is not None:  # a floor is level, so use the ground under the middle
+    if dem is not None:  # a floor is level, so use the ground height at the middle of the building
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
     return Building(
         name=model.name, height_m=model.height_m, material=model.material, source=model.source,
@@ -745,7 +746,7 @@ def _trees(
 
 
 def _single(models: list[SingleTreeModel], sizes: TreeSizes) -> Trees:
-    """Return trees with their own sizes. Crowns begin at the same share of the height as those of all trees."""
+    """Return trees with their own sizes. Crowns begin at the same share of the height as for all trees."""
     for index, model in enumerate(models):
         with _at("trees", "single", index):
             _check_near([model.at_m], "trees.single")
@@ -819,7 +820,7 @@ def place_trees(
     Returns
     -------
     Trees
-        The trees, which are fewer if they do not fit (see :func:`wanted_trees`).
+        The trees. If the area is too small for all of them, there are fewer than :func:`wanted_trees`.
 
     Notes
     -----
@@ -865,17 +866,17 @@ def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random
                 darts = darts[cKDTree(placed).query(darts, distance_upper_bound=spacing_m)[0] >= spacing_m]
             darts = darts[_first_come(darts, spacing_m)]
         added = darts[:missing]
-        # random packing ends near half of the area, so the last trees would take very long
+        # random placement slows down when about half of the area is occupied, so the last trees would take very long
         stalled = stalled + 1 if len(added) < 1e-3 * count else 0
         placed = np.concatenate([placed, added])
     return placed
 
 
 def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
-    """Return a mask of points (n, 2) that have no earlier selected point closer than ``spacing_m``."""
+    """Return a mask of points (n, 2). A point is selected if no earlier selected point is within ``spacing_m``."""
     keep = np.zeros(len(points), dtype=bool)
     open_ = np.ones(len(points), dtype=bool)
-    # find pairs that are strictly closer, because two trees at exactly the spacing are allowed
+    # find pairs that are closer than the spacing; two trees at exactly the spacing are allowed
     pairs = cKDTree(points).query_pairs(np.nextafter(spacing_m, 0), output_type="ndarray") if len(points) else None
     if pairs is None or not len(pairs):
         return open_
@@ -901,7 +902,7 @@ def _checked_area(area: Area | None, east: Sequence[float], north: Sequence[floa
 
 
 def _check_near(points_m: list[tuple[float, float]], name: str) -> None:
-    # check before polygons are made, because coordinates of a map grid are valid outlines elsewhere
+    # check the coordinates first, because coordinates of a map grid would be valid outlines far from the site
     away = max(math.hypot(*point) for point in points_m)
     if away > _FAR_POLYGON_M:
         raise UsageError(
@@ -930,7 +931,7 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
 
 
 def inputs_of_site(site: str | Path, folder: Path = Path()) -> list[Path]:
-    """Return the site file and the files that it names. Empty if its reader reports an error."""
+    """Return the site file and the files that it names. The list is empty if the site file has an error."""
     with suppress(AerpawCmpError, OSError):
         return [place for _, _, place in site_files(str(site), folder)]
     return []

@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.calibration import Observed, Recipe, campaign_left_out, learn
-from aerpaw_cmp.compare.gains import (
-    FlightEvidence,
-    GainModel,
-    GainProcess,
-    LinkSamples,
-    Term,
-    gain_covariance,
-    rotated,
-)
+from aerpaw_cmp.compare.gains import FlightEvidence, GainModel, GainProcess, LinkSamples, Term, gain_covariance, rotated
 from tests.compare.test_direction_gain import drawn, planted
 
 GAINS = {"uav": drawn(1.0, 3.2, 1), "A": drawn(0.5, 3.4, 2), "B": drawn(0.5, 3.4, 3), "C": drawn(0.5, 3.4, 4)}

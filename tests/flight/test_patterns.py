@@ -142,12 +142,7 @@ def test_an_area_without_room_is_refused():
     with pytest.raises(UsageError, match="no area remains"):
         allowed_area(shapely.box(0, 0, 50, 50), [], np.array([[25.0, 25.0, 0.0]]), 60.0)
     with pytest.raises(UsageError, match="no leg of 40 m"):
-        route_of(
-            Pattern(azimuth_deg=0.0, height_m=30.0, nose="along"),
-            shapely.box(0, 0, 20, 20),
-            8.0,
-            60.0,
-        )
+        route_of(Pattern(azimuth_deg=0.0, height_m=30.0, nose="along"), shapely.box(0, 0, 20, 20), 8.0, 60.0)
 
 
 def test_files_hold_the_route_that_was_planned(tmp_path: Path):

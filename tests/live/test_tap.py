@@ -434,15 +434,7 @@ def test_status_line():
     assert format_status(status) == "NO PORT  RSRP -  SINR -  0.0 Hz  0 gaps  0.0 MiB  disk ?  NO CSI"
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"ri_hz": 0},
-        {"ri_hz": float("nan")},
-        {"duration_s": 0},
-        {"no_csi_alarm_s": 0},
-    ],
-)
+@pytest.mark.parametrize("values", [{"ri_hz": 0}, {"ri_hz": float("nan")}, {"duration_s": 0}, {"no_csi_alarm_s": 0}])
 def test_wrong_settings(tmp_path, values):
     with pytest.raises(UsageError):
         TapSettings(tmp_path, **values)

@@ -8,12 +8,7 @@ from hypothesis import strategies as st
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps import variogram
 from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.variogram import (
-    PAPER_BIEXPONENTIAL,
-    field_correlation,
-    fit_biexponential,
-    vector_correlation,
-)
+from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL, field_correlation, fit_biexponential, vector_correlation
 
 RNG = np.random.default_rng(3)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.content import KEY, MARKS
-from ..common.errors import InputError, UsageError, about_file, parsing
+from ..common.errors import AerpawCmpError, InputError, UsageError, about_file, parsing
 from ..common.files import LARGEST_TABLE, read_bounded, read_input
 from ..common.jsonable import json_object
 from ..common.native import read as read_native
@@ -165,6 +165,22 @@ def read_foreign(path: Path, data: FlightData, near_m: float = AGAINST_DISTANCE_
     return ForeignPrediction(path=path, quantity=quantity, table=table, sha256=digest, near_m=near_m, **about)
 
 
+def possible(score: Callable[[Any], Any], predictions: Iterable[Any]) -> tuple[list[Any], list[str]]:
+    """Return the results of the predictions that can be used, and the messages of the others.
+
+    If none can be used, the first error is raised.
+    """
+    results, errors = list[Any](), list[AerpawCmpError]()
+    for prediction in predictions:
+        try:
+            results.append(score(prediction))
+        except AerpawCmpError as error:
+            errors.append(error)
+    if errors and not results:
+        raise errors[0]
+    return results, [f"{error}. This prediction was not scored." for error in errors]
+
+
 def _predicted_unit(path: Path, data: FlightData) -> str:
     """Return the unit of the levels of ``predict`` from its metrics.json, or an empty text for several units.
 
@@ -233,10 +249,11 @@ def _netcdf(content: bytes, path: Path) -> Read:
         for name, (dims, array) in known.items()
         if name in _COLUMNS and set(dims) <= set(at)
     }
-    if "time" in columns and columns["time"].dtype.kind in "fiu":
-        columns["time_s"] = columns.pop("time")
+    clock = "time_utc" if "time_utc" in columns else "time"
+    if clock in columns and columns[clock].dtype.kind in "fiu":
+        columns["time_s"] = columns.pop(clock)
         units = {name.lower(): unit for name, unit in notes["units"].items()}
-        size, since, start = str(units.get("time", "")).partition(" since ")
+        size, since, start = str(units.get(clock, "")).partition(" since ")
         if since:
             with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
                 after = pd.to_timedelta(columns["time_s"], unit=size.strip().lower())  # type: ignore[call-overload]
@@ -487,7 +504,7 @@ def judge(given: ForeignPrediction, data: FlightData, result: FlightResult) -> d
     if sum(s["unmatched"] - s["matched"] for s in every) > 0 and (cause := _wrong_heights(given, data, result)):
         remarks.append(f"{name}: most samples have no prediction. Likely cause: {cause}.")
     if series and (few := [item.name for item in result.rss if item.tower in predicted and item.name not in series]):
-        remarks.append(f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have a predicted level; not scored.")
+        remarks.append(f"{name}: fewer than {FEWEST} samples of {', '.join(few)} have both levels; not scored.")
     if trained := [item.name for item in result.rss if item.training and item.name in series]:
         remarks.append(f"Ray tracing has no score on {', '.join(trained)}: its antennas were learned from this flight.")
     if len(common) < len(series):

@@ -234,7 +234,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..report.flight_data import pose_paths, report_data
     from ..report.page import json_text, write_file
     from .flight_run import check_recommended, recommended_text, report_stages, run_flight
-    from .referee import judge, read_foreign
+    from .referee import judge, possible, read_foreign
     from .tasks import other_inputs
 
     _check_options(flight, chosen, options)
@@ -249,7 +249,8 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             target = outputs.enter_context(file)
         with stages("read"):
             data = load_data(settings, flight.parent, options.logs_root)
-            given = [read_foreign(path, data, chosen.against_distance_m) for path in chosen.against]
+            read = partial(read_foreign, data=data, near_m=chosen.against_distance_m)
+            given, unread = possible(read, chosen.against)
         if chosen.recommend is not None:
             check_recommended(data)
         stages.checked(lambda: report_stages(data, chosen.figures))
@@ -264,9 +265,12 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             paths=pose_paths(data, replays),
         )
         with stages("score predictions") if given else nullcontext():
-            cards = [judge(item, data, flight_run.result) for item in given]
+            cards, unscored = possible(partial(judge, data=data, result=flight_run.result), given)
         if cards:
-            record = replace(record, extra_metrics={**record.extra_metrics, "referee": cards})
+            scores = {"referee": cards, "referee_refused": (refused := [*unread, *unscored])}
+            record = replace(
+                record, extra_metrics={**record.extra_metrics, **scores}, warnings=(*refused, *record.warnings)
+            )
         if target is not None:
             text, sentence = recommended_text(load_flight(flight), flight_run.ladder, flight)
             target.write(sealed(text))

@@ -442,7 +442,7 @@ def test_a_channel_with_too_few_predictions_is_named(said, flown):
     few.assign(east_m=few["east_m"].where(few["channel"] == "USRP1", 9e3)).to_csv(folder / "few.csv", index=False)
     verdict = judge(read_foreign(folder / "few.csv", data), data, flown[1])
     assert list(verdict["levels"]["LW1"]) == ["USRP1"]
-    assert any("few.csv: fewer than 20 samples of LW1 USRP2 have a predicted level" in s for s in verdict["remarks"])
+    assert any("few.csv: fewer than 20 samples of LW1 USRP2 have both levels" in s for s in verdict["remarks"])
 
 
 @pytest.mark.parametrize(

@@ -50,10 +50,10 @@ def ours(flight: Path) -> pd.DataFrame:
     return pd.read_csv(flight / "rss.csv")
 
 
-def scored(flight: Path, *files: Path, near: str = "5") -> list[dict]:
+def scored(flight: Path, *files: Path, near: str = "5", code: int = 0) -> list[dict]:
     out = flight / "out"
     words = ["report", str(flight / "s" / "flight.yaml"), "-o", str(out), "--audit", "none", "-q", "--force"]
-    assert main([*words, "--against-distance", near, *(w for file in files for w in ("--against", str(file)))]) == 0
+    assert main([*words, "--against-distance", near, *(w for file in files for w in ("--against", str(file)))]) == code
     cards = json.loads((out / "card.json").read_text())
     assert json.loads((out / "metrics.json").read_text())["referee"] == cards
     return cards
@@ -124,11 +124,12 @@ def test_a_copy_of_our_levels_in_three_formats_scores_as_ours_do(flight: Path) -
     xarray = pytest.importorskip("xarray")
     wide = by_time[by_time["channel"] == "USRP1"].pivot(index="time_utc", columns="tower", values="level_dbm")
     times = pd.to_datetime(wide.index.to_numpy()).tz_localize(None)
-    xarray.Dataset(
-        {"level_dbm": (("time", "tower"), wide.to_numpy())}, coords={"time": times, "tower": list(wide.columns)}
-    ).to_netcdf(flight / "python.nc")
-    cards = scored(flight, flight / "matlab.csv", flight / "loss.csv", flight / "python.nc", near="0.01")
-    assert [card["prediction"] for card in cards] == ["matlab.csv", "loss.csv", "python.nc"]
+    for clock in ("time", "time_utc"):
+        given = {clock: times, "tower": list(wide.columns)}
+        xarray.Dataset({"level_dbm": ((clock, "tower"), wide.to_numpy())}, given).to_netcdf(flight / f"{clock}.nc")
+    names = ["matlab.csv", "loss.csv", "time.nc", "time_utc.nc"]
+    cards = scored(flight, *(flight / name for name in names), near="0.01")
+    assert [card["prediction"] for card in cards] == names
     for card in cards:
         assert set(card["levels"]) == {"LW1", "LW3"}
         for channels in card["levels"].values():
@@ -156,6 +157,19 @@ def test_half_a_route_is_counted_as_unmatched(cards: dict[str, dict]) -> None:
     entry = cards["half.csv"]["levels"]["LW1"]["USRP1"]
     assert entry["unmatched"] > 0.2 * entry["matched"]
     assert "at other times have none" in cards["half.csv"]["sentence"]
+
+
+def test_a_refused_file_does_not_prevent_the_score_of_another(flight: Path, cards: dict[str, dict]) -> None:
+    half = pd.read_csv(flight / "half.csv")
+    half.assign(level_dbm=1e-9).to_csv(flight / "watt.csv", index=False)
+    half.assign(time_utc="2031" + half["time_utc"].str[4:]).to_csv(flight / "late.csv", index=False)
+    (card,) = scored(flight, *(flight / f"{name}.csv" for name in ("watt", "late", "half")), code=1)
+    assert card == cards["half.csv"]
+    metrics = json.loads((flight / "out" / "metrics.json").read_text())
+    linear, late = metrics["referee_refused"]
+    assert "watt.csv: a median level_dbm of 1e-09" in linear
+    assert "late.csv: fewer than 20 samples" in late
+    assert {linear, late} < set(metrics["warnings"])
 
 
 def test_files_in_the_manner_of_three_programs_are_scored(flight: Path) -> None:

@@ -73,7 +73,8 @@ def report(
     outcome = run.run_report(flight, chosen, options)
     if not answered(outcome.metrics):
         _print_report_summary(outcome)
-    return max(_verdict(outcome, strict), _nothing_compared(outcome.metrics))
+    refused = bool(outcome.metrics.get("referee_refused"))
+    return max(_verdict(outcome, strict), _nothing_compared(outcome.metrics), refused)
 
 
 def _print_cards(verdict: Mapping[str, Any]) -> None:

@@ -281,7 +281,7 @@ def _size(tags: Mapping[str, str], keys: tuple[str, ...], most_m: float, what: s
     size = mapfiles.positive_metres(tags, keys, notes)
     if size is None or _SMALLEST_SIZE_M <= size <= most_m:
         return size
-    notes.append(f"{what.format(size)}; feet or centimetres? The site's default is used")
+    notes.append(f"{what.format(size)} (feet or cm?); the site's default is used")
     return None
 
 
@@ -465,7 +465,7 @@ def _describe(shape: _Shape, outline: mapfiles.Outline, actions: list[str]) -> N
     height = mapfiles.height_of(tags, notes)
     levels = mapfiles.levels_of(tags, notes)
     if height is not None and not _LOWEST_M <= height <= TALLEST_M:
-        notes.append(f"a height of {height:g} m; feet or centimetres?")
+        notes.append(f"a height of {height:g} m is implausible (feet or cm?)")
         height = None
     if levels and levels * _LEVEL_M > TALLEST_M:
         notes.append(f"{levels:g} levels are more than any building has")

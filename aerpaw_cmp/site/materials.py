@@ -65,9 +65,10 @@ class Material:
         # suggest the properties at the nearest frequency of the table, as text that a user can paste
         edge = low if frequency_ghz < low else high
         near = stated_name(self.relative_permittivity(edge * 1e9).real, self.conductivity_s_per_m(edge * 1e9), None)
+        key = "ground_material" if self.name.endswith("ground") else "material of a building"
         raise UsageError(
-            f"ITU-R P.2040 gives no values for '{self.name}' at {frequency_ghz:g} GHz",
-            expected=f"{low:g}-{high:g} GHz, or stated constants such as '{near}' (those of {edge:g} GHz)",
+            f"ITU-R P.2040 gives no values for '{self.name}' ({key}) at {frequency_ghz:g} GHz",
+            expected=f"{low:g}-{high:g} GHz, or in site.yaml '{key.split()[0]}: {near}' (the values of {edge:g} GHz)",
             cause="the carrier was given in MHz or GHz where hertz are expected" if frequency_hz < 1e6 else None,
         )
 
@@ -140,7 +141,7 @@ def material(name: str) -> Material:
         near = difflib.get_close_matches(key, _TABLE, n=1, cutoff=0.4)
         raise UsageError(
             f"unknown material '{name}'",
-            expected="one of " + ", ".join(MATERIALS),
+            expected=f"one of {', '.join(MATERIALS)}, or '{stated_name(3.5, 0.02, None)}'",
             cause=f"did you mean '{near[0]}'?" if near else None,
         )
     thickness, band = _TABLE[key]

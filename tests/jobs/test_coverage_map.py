@@ -290,7 +290,7 @@ def test_a_missing_library_costs_its_own_file_alone(site, tmp_path, monkeypatch)
         (["--spacing", "5000"], "no cell"),
         (["--quick", "--rank-altitude", "30"], "rank height"),
         # before the search, which takes minutes in a town
-        (["--quick", "--carrier-ghz", "28", "--dry-run"], "P.2040 gives no values for 'medium_dry_ground' at 28 GHz"),
+        (["--quick", "--carrier-ghz", "28", "--dry-run"], r"'medium_dry_ground' \(ground_material\) at 28 GHz"),
     ],
 )
 def test_wrong_wishes_are_one_message(words, said, tmp_path):

@@ -221,7 +221,7 @@ def test_heights_that_cannot_be_metres(tmp_path: Path) -> None:
     assert imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "828"})).buildings[0].height_m == 828
     outlines = imported(tmp_path, ([square(0, 0)], BARN), ([square(100, 0)], {"building": "yes", "height": "2400"}))
     assert [b.height_m for b in outlines.buildings] == [7.5, 6]
-    assert said(outlines, "a.json: f1: a height of 2400 m; feet or centimetres?; it is drawn 6 m high")
+    assert said(outlines, "a.json: f1: a height of 2400 m is implausible (feet or cm?); it is drawn 6 m high")
     outlines = imported(tmp_path, ([square(0, 0)], {"building": "yes", "building:levels": "2400"}))
     assert said(outlines, "a.json: f0: 2400 levels are more than any building has; it is drawn 6 m high")
     outlines = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "20", "building:levels": "2"}))

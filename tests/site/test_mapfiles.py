@@ -94,7 +94,7 @@ def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
     np.testing.assert_allclose(trees.trunk_diameter_m, [0.5, 0.4, 0.4, 0.4, 0.4, 0.8, 0.4, 0.4, 0.38, 0.4])
     assert "t.osm: node 4: the height 'tall' is not a length" in actions
     said = ("node 5: a tree 400 m high", "node 6: the circumference '250' is taken as centimetres", "node 7: a trunk 250 m",
-            "node 7: a crown 800 m", "node 8: a trunk 80 m around; feet or centimetres?", "node 10: a tree 0.001 m high")  # fmt: skip
+            "node 7: a crown 800 m", "node 8: a trunk 80 m around (feet or cm?); the site", "node 10: a tree 0.001 m high")  # fmt: skip
     for words in said:
         assert any(words in action for action in actions), words
 

@@ -140,6 +140,9 @@ def test_the_documented_site_is_valid() -> None:
     site = build_site(model)
     assert site.towers["LW2"].position_m[2] == pytest.approx(10.0)
     assert len(site.trees) > 10
+    packaged = (Path(__file__).parents[2] / "aerpaw_cmp/site/data/lake_wheeler.yaml").read_text()
+    added = text.split("```yaml\ntowers:\n")[1].split("```")[0]
+    assert "NEW" in parse_yaml(packaged.replace("\ntowers:\n", f"\ntowers:\n{added}"), SiteModel).towers
 
 
 def test_the_documented_differences_are_the_computed_ones() -> None:

@@ -203,7 +203,8 @@ def parsing(
     except Exception as error:
         if isinstance(error, _FAULTS) and not any_shape and _is_raised_here(error):
             raise
-        words = f"{type(error).__name__}: {one_line(str(error)[:200])}"
+        words = "it has no" if isinstance(error, KeyError) else f"{type(error).__name__}:"
+        words += f" {one_line(str(error)[:200])}"
         # match the base class: UnicodeDecodeError is a UnicodeError
         words = next((text for kind, text in _IN_WORDS.items() if isinstance(error, kind)), words)
         raise InputError(f"cannot be read ({words})", expected=expected, cause=cause, path=path) from error

@@ -238,10 +238,9 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
         raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
     if version != _VERSION:
         found, expected = f"flight file of version {version}", f"version {_VERSION}"
-        raise InputError(found, expected=expected, cause="a newer version of this tool wrote it", path=path)
-    with parsing(
-        path, "a flight file of 'aerpaw-cmp ingest -o'", "a truncated copy: ingest the logs again", any_shape=True
-    ):
+        raise InputError(found, expected=expected, cause="another version of this tool wrote it", path=path)
+    cause = "a truncated copy, or a file of another version of this tool: ingest the logs again"
+    with parsing(path, "a flight file of 'aerpaw-cmp ingest -o'", cause, any_shape=True):
         return [_read_file(items, name) for name in _numbered(items, "files/")]
 
 

@@ -439,7 +439,8 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
     if item["type"] == "missing" and isinstance(location[-1], int):
         return f"{'.'.join(map(str, location[:-1]))}: entry {location[-1] + 1} of the list is missing", None
     if item["type"] == "missing":
-        return f"the key '{where}' is missing", None
+        fields = [at.model_fields.get(str(location[-1])) for at in _models_at(model, location[:-1])]
+        return f"the key '{where}' is missing", next((field.description for field in fields if field), None)
     message = expectation(item)
     if item["type"] in ("value_error", "assertion_error"):
         return (f"{where}: {message}" if where else message), None

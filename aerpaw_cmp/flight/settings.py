@@ -547,6 +547,12 @@ class Caution:
     used: bool = False
 
 
+_NO_LOGS = (
+    "a plan without logs. 'predict' and 'channel' need 'logs: []'; 'report' reads and 'simulate' writes logs that are "
+    "listed as {path: LW1/log.txt, reader: sounder_log, node: LW1}"
+)
+
+
 class FlightFile(StrictModel):
     """All settings of a flight.yaml.
 
@@ -570,7 +576,7 @@ class FlightFile(StrictModel):
     timezone: str | None = None
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
     marks: list[str] = []
-    logs: list[LogSettings]
+    logs: Annotated[list[LogSettings], Field(description=_NO_LOGS)]
     antennas: dict[str, str] = {}
     link: LinksSettings = LinksSettings()
     rt: RtSettings = RtSettings()

@@ -290,6 +290,9 @@ class FlightSimulator:
         plan = self.settings.flight.plan
         if plan is None:
             raise UsageError("the flight file has no plan", expected="flight.plan with start and waypoints")
+        if not self.settings.logs:
+            entry = "{path: LW1/log.txt, reader: sounder_log, node: LW1}"
+            raise UsageError("the flight file lists no log to write", expected=f"entries under 'logs', such as {entry}")
         if self.settings.timezone is None:
             raise UsageError("the flight file names no time zone", expected="such as timezone: America/New_York")
         self.plan = plan

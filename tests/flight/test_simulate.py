@@ -12,8 +12,9 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight import simulate
-from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator, correlated_noise, plan_trajectory, telemetry_frame
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -70,6 +71,18 @@ def test_a_plan_moves_or_waits_and_is_no_longer_than_can_be_held() -> None:
     assert plan_trajectory(planned([(0, 0, 0, 0), (50, 0, 0, 0)], rss_s=2e-6)).duration_s == 10.0  # 5 million samples
     with pytest.raises(UsageError):
         plan_trajectory(planned([(0, 0, 0, 0), (50, 0, 0, 0)], rss_s=1.99e-6))
+
+
+def test_a_plan_without_logs_is_one_message(tmp_path: Path) -> None:
+    points = "{east_m: 0, north_m: 0, height_m: 9}, {east_m: 9, north_m: 0, height_m: 9}"
+    plan = f"flight: {{name: f, plan: {{start: '2025-06-01T10:00:00', waypoints: [{points}]}}}}\n"
+    with pytest.raises(
+        UsageError, match=r"the key 'logs' is missing\. Likely cause: a plan without logs.*'logs: \[\]'"
+    ):
+        parse_yaml(plan, FlightFile)
+    nothing = FlightSimulator(parse_yaml(plan + "logs: []\n", FlightFile), load_site("lake_wheeler"), tmp_path)
+    with pytest.raises(UsageError, match="lists no log to write"):
+        nothing.run(tmp_path / "out")
 
 
 def test_correlated_noise_keeps_what_the_memory_keeps() -> None:

@@ -246,6 +246,13 @@ class Site:
                 if building.base_m < up < building.base_m + building.height_m
                 and building.footprint.contains(Point(tower.east_m, tower.north_m))
             ]
+            clauses += [
+                f"the antenna of tower {tower.name} is inside wood '{forest.name}' (canopy at {forest.height_m:g} m), "
+                "so opaque foliage blocks each path: correct the position, or cut a clearing out of the wood"
+                for forest in self.forests
+                if up - tower.ground_m < (forest.height_m or 0.0)
+                and forest.area.contains(Point(tower.east_m, tower.north_m))
+            ]
         if self.dem is not None:
             places = {f"tower {tower.name}": (tower.east_m, tower.north_m) for tower in chosen}
             for name, (east, north) in {"the site's origin": (0.0, 0.0), **places}.items():

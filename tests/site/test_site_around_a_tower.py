@@ -20,7 +20,10 @@ def campus(path: Path, latitude: float = LATITUDE, longitude: float = LONGITUDE)
     ring += [(longitude, latitude + 4e-4), ring[0]]
     feature = {"type": "Feature", "properties": {"building": "yes", "height": "20", "name": "hall"}}
     feature["geometry"] = {"type": "Polygon", "coordinates": [[list(point) for point in ring]]}
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    grove = [[east + 5e-4, north] for east, north in ring]
+    wood = {"type": "Feature", "properties": {"natural": "wood", "height": "20", "name": "grove"}}
+    wood["geometry"] = {"type": "Polygon", "coordinates": [grove]}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature, wood]}))
     return path
 
 
@@ -42,13 +45,19 @@ def test_first_tower_is_the_origin_and_buildings_keep_their_place(tmp_path: Path
     assert min(east, -south, north) >= 500
 
 
-def test_an_antenna_inside_a_building_is_reported_by_the_import(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("east_deg", "about"),
+    [
+        (2e-4, "(15.0 m up) is inside building 'hall' (roof at 20.0 m)"),
+        (7e-4, "is inside wood 'grove' (canopy at 20 m)"),
+    ],
+)
+def test_an_antenna_inside_an_object_is_reported_by_the_import(east_deg: float, about: str, tmp_path: Path) -> None:
     """The first map or flight would show a tower that no path reaches."""
-    inside = [f"roof={LATITUDE + 2e-4},{LONGITUDE + 2e-4},{height}" for height in (15, 25)]
+    inside = [f"roof={LATITUDE + 2e-4},{LONGITUDE + east_deg},{height}" for height in (15, 25)]
     low, high = (import_site([campus(tmp_path / "campus.geojson")], towers=[tower])[1] for tower in inside)
-    about = "warning: the antenna of tower roof (15.0 m up) is inside building 'hall' (roof at 20.0 m)"
-    assert [text.startswith(about) for text in low].count(True) == 1
-    assert not any("inside building" in text for text in high)
+    assert [text.startswith(f"warning: the antenna of tower roof {about}") for text in low].count(True) == 1
+    assert not any("inside" in text for text in high)
 
 
 def test_a_large_map_shows_its_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,7 +66,7 @@ def test_a_large_map_shows_its_progress(tmp_path: Path, monkeypatch: pytest.Monk
     towers = (f"roof={LATITUDE},{LONGITUDE},25",)
     files = [campus(tmp_path / name) for name in ("one.geojson", "two.geojson")]
     import_site(files, towers=towers, progress=lambda text, share=None: told.append((text, share)))
-    assert told == [("outlines of one.geojson", 1.0), ("outlines of two.geojson", 1.0)]
+    assert told == [(f"outlines of {file.name}", share) for file in files for share in (0.5, 1.0)]
 
 
 def test_a_tower_away_from_the_map_or_from_the_first_tower_is_named(tmp_path: Path) -> None:

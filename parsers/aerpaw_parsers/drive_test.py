@@ -499,13 +499,13 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
 
 def _assumed_units(sheet: _sheet.Sheet) -> Iterator[str]:
     """Yield a sentence about each level without a unit that may have another unit than the one assumed."""
-    for i, what in enumerate(sheet.meanings):
-        if what is None or what.quantity.role != "rss" or what.indirect or sheet.program or sheet.unit_read(i):
-            continue
-        known = sheet.numbers(i)[np.isfinite(sheet.numbers(i))]
-        near = what.quantity.name == "RSSI" and len(known) and np.median(known) > _NEAR_FULL_SCALE
-        if near or (len(known) and what.quantity.name == "power"):
-            text = f"no unit is written: read as {what.quantity.unit}, although levels are such as {known[0]:g}"
+    levels = [i for i, what in enumerate(sheet.meanings) if what and what.quantity.role == "rss" and not what.indirect]
+    for i in levels if not sheet.program else ():
+        what, known = sheet.meanings[i], sheet.numbers(i)[np.isfinite(sheet.numbers(i))]
+        # a program that also writes RSRP has RSSI in dBm; the only level of a table may be relative to full scale
+        doubtful = len(levels) == 1 or (len(known) and np.median(known) > _NEAR_FULL_SCALE)
+        if what and len(known) and not sheet.unit_read(i) and {"RSSI": doubtful, "power": True}.get(what.quantity.name):
+            text = f"no unit is written: read as {what.quantity.unit}; the first level is {known[0]:g}"
             yield f"column {sheet.names[i]!r}: {text}. If this is wrong, use --unit"
 
 

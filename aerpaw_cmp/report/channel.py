@@ -118,7 +118,7 @@ class Channel:
     @property
     def warnings(self) -> list[str]:
         """Warnings about the limits of the numbers."""
-        return [*self.along.remarks, *self.replay.left_out]
+        return [*self.along.remarks, *(f"Not modelled: {what}" for what in self.replay.left_out)]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
         """Return values per path (paths, ...) as an array (paths per link, poses, towers, ...), and None for None."""

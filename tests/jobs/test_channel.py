@@ -319,8 +319,9 @@ def test_variables_are_selected_by_labels_in_python_and_in_the_file(tmp_path, cf
 
 
 def test_points_without_times_have_no_doppler_and_a_site_without_memory_no_level(folder, capsys):
-    (folder / "own.yaml").write_text(OWN_SITE)
-    (folder / "own_flight.yaml").write_text(PLAN + "site: own.yaml\n")
+    wall = "buildings: [{name: b, height_m: 5, polygon_m: [[9, 9], [20, 9], [20, 20], [9, 20]]}]\n"
+    (folder / "own.yaml").write_text(OWN_SITE + wall)
+    (folder / "own_flight.yaml").write_text(PLAN + "site: own.yaml\nrt: {diffraction: edges}\n")
     points = "east_m,north_m,height_m\n50,0,30\n50,40,30\n90,90,30\n"
     (folder / "points.csv").write_text(points)
     line = ["channel", str(folder / "own_flight.yaml"), "--route", str(folder / "points.csv"), "--json"]
@@ -330,6 +331,7 @@ def test_points_without_times_have_no_doppler_and_a_site_without_memory_no_level
     assert (printed["has_doppler"], printed["has_level"], printed["poses"]) == (False, False, 3)
     assert any("No Doppler shift" in text for text in printed["warnings"])
     assert any("No calibrated level" in text for text in printed["warnings"])
+    assert any(text.startswith("Not modelled: diffraction over two edges") for text in printed["warnings"])
     assert pd.read_csv(folder / "own_out" / "channel.csv").doppler_hz.isna().all()
     assert main([*line[:-1], "-o", str(folder / "own_nc")]) == 0
     assert capsys.readouterr().out.startswith("Link rss (the default), 3.3 GHz: ")

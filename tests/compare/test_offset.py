@@ -8,12 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.compare.offset import (
-    difference_moments,
-    grid_offset,
-    nearest_offset,
-    offset_grid,
-)
+from aerpaw_cmp.compare.offset import difference_moments, grid_offset, nearest_offset, offset_grid
 
 tenths = st.integers(-2000, 2000).map(lambda k: k / 100)
 

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.level import detection_floor_db, nearest_points
-from aerpaw_cmp.compare.referee import (
-    level_card,
-    measured_thresholds,
-)
+from aerpaw_cmp.compare.referee import level_card, measured_thresholds
 from aerpaw_cmp.compare.statistics import paired_difference
 
 N = 4000

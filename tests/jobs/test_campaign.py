@@ -223,9 +223,7 @@ def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None
     assert pair.offset_db == pytest.approx(6.0, abs=0.2)
     assert abs(pair.place_correlation) < 0.2  # nothing but noise comes back
     wrong = np.where(np.arange(n) % 400 < 200, 5.0, -5.0)
-    (pair,) = repeats(
-        [rss_row("a", "USRP1", level + wrong, level), rss_row("b", "USRP1", level + wrong, level)],
-    )
+    (pair,) = repeats([rss_row("a", "USRP1", level + wrong, level), rss_row("b", "USRP1", level + wrong, level)])
     assert pair.rmse_db == pytest.approx(0.0, abs=1e-9)
     assert pair.place_correlation == pytest.approx(1.0)
 

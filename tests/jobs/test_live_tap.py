@@ -51,10 +51,7 @@ def test_a_modem_that_is_not_there_ends_all_at_the_start(modems, tmp_path):
 
 def test_ports_of_one_name_get_folders_of_their_own(tmp_path):
     links = [tmp_path / "a" / "modem", tmp_path / "b" / "modem"]
-    with (
-        FaultyModem(link=links[0]) as first,
-        FaultyModem(link=links[1]) as second,
-    ):
+    with FaultyModem(link=links[0]) as first, FaultyModem(link=links[1]) as second:
         settings = TapSettings(tmp_path / "log", duration_s=0.3)
         tap_modems(settings, [str(first.port), str(second.port)], shown()[0], lambda *_: None)
     assert sorted(path.name for path in (tmp_path / "log").iterdir()) == ["modem-1", "modem-2"]

@@ -6,11 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.maps.grid import (
-    Grid,
-    serving_tower,
-    voronoi_borders,
-)
+from aerpaw_cmp.maps.grid import Grid, serving_tower, voronoi_borders
 
 AREA = (-540.0, 540.0, -1065.0, 1065.0)
 

@@ -334,11 +334,7 @@ def test_random_leave_one_out_does_not_see_the_target():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [
-        ({"neighbours": 0}, "neighbours = 0"),
-        ({"radius_m": -1.0}, "radius_m"),
-        ({"selection": "all"}, "selection"),
-    ],
+    [({"neighbours": 0}, "neighbours = 0"), ({"radius_m": -1.0}, "radius_m"), ({"selection": "all"}, "selection")],
 )
 def test_wrong_settings_are_named(arguments, message):
     with pytest.raises(UsageError, match=message):

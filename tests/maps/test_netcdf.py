@@ -49,11 +49,7 @@ def path(tmp_path):
 
 
 def write(path):
-    about = file_attributes(
-        title="A <site>",
-        source="ray tracing",
-        comment="A gap has no path.",
-    )
+    about = file_attributes(title="A <site>", source="ray tracing", comment="A gap has no path.")
     number = GRID.raster(np.arange(len(GRID)))
     level = Layer(
         name="rss_sd", tower="LW1", height_m=30.0, values=number / 4.0, unit="dB", quantity="Standard deviation"

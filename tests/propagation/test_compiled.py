@@ -22,10 +22,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation import compiled, engines
 from aerpaw_cmp.propagation.field import sum as field_sum
-from aerpaw_cmp.propagation.geometry import (
-    Links,
-    site_faces,
-)
+from aerpaw_cmp.propagation.geometry import Links, site_faces
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import beams as prisms

@@ -52,10 +52,7 @@ def depth(start: object, end: object, stand: Trees, shape: str = "cone") -> floa
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.integers(0, 10_000),
-    st.sampled_from(["cone", "cylinder"]),
-    st.floats(0.05, 0.95),
-    st.floats(-math.pi, math.pi),
+    st.integers(0, 10_000), st.sampled_from(["cone", "cylinder"]), st.floats(0.05, 0.95), st.floats(-math.pi, math.pi)
 )
 def test_reversal_splitting_and_turning_change_nothing(seed: int, shape: str, cut: float, angle: float) -> None:
     stand = grove(40, seed)

@@ -1,7 +1,7 @@
 """Ingest AERPAW field logs, replay the flight by ray tracing, compare the two.
 
-The names below are stable (docs/api.md); everything else may change. Importing this package loads nothing heavy: each
-name is imported when it is first used.
+The names below are stable (docs/api.md); everything else may change. Importing this package is fast, because each name
+is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -52,5 +52,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names only: imports and machinery of this file are noise in a notebook."""
+    """Return only the public names, because a notebook would otherwise also list the internals of this file."""
     return list(__all__)

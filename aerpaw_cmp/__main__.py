@@ -1,13 +1,13 @@
-"""Entry point of the command line. It answers ``--help`` from a table; :mod:`aerpaw_cmp.cli` runs all commands.
+"""Entry point of the command line. It prints ``--help`` from a table, and :mod:`aerpaw_cmp.cli` runs all commands.
 
-This is the one place where an exception becomes a message and an exit code:
+This is the only place where an exception becomes a message and an exit code:
 
 ====  ==========================================================
 0     done
 1     the job ran, but a stated check failed
 2     wrong usage or configuration
 3     an input could not be read, or an output not written
-70    a fault of the program itself (``--debug`` shows where)
+70    an error in the program itself (``--debug`` shows where)
 130   interrupted; 143 by SIGTERM, 129 by SIGHUP
 141   the reader of the output has closed it (``aerpaw-cmp ... | head``)
 ====  ==========================================================
@@ -29,14 +29,14 @@ OUTPUT_FAULT = 3
 BROKEN_PIPE = 141
 # A shell sets this variable to request completions of the command line.
 _COMPLETE = "_AERPAW_CMP_COMPLETE"
-# With this variable, Typer takes the shell from the command line instead of the parent process (there may be none).
+# With this variable, Typer takes the shell from the command line instead of the parent process (which may not exist).
 _SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
 ISSUES = "the project's issue tracker"
-# Threads of BLAS: the tool solves many small systems, on which several threads wait for each other (3.6 times the
-# processor time of the sample's report). Values that the user has set are not changed.
+# Limits on the threads of BLAS. The program solves many small systems, for which several threads wait for each other
+# (3.6 times the processor time for the sample report). Values that the user has set are not changed.
 BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-# Errors of invalid paths, which methods of pathlib such as ``is_dir`` raise.
+# Errors that methods of pathlib, such as ``is_dir``, raise for invalid paths.
 _UNUSABLE = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EIO, errno.ESTALE)
 LONGEST_NAME = 120
 
@@ -46,7 +46,7 @@ NEW_OBJECTS = 10_000
 
 
 def help_text() -> str:
-    """Text that ``aerpaw-cmp --help`` prints."""
+    """Return the text that ``aerpaw-cmp --help`` prints."""
     from .common.text import COMMANDS
 
     width = max(map(len, COMMANDS))
@@ -106,7 +106,7 @@ def _quick_answer(arguments: list[str]) -> int | None:
 
 
 def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
-    """Message to the user about an exception that reached the top, and the exit code."""
+    """Return the message to the user about an exception that nothing else caught, and the exit code."""
     from .common.errors import AerpawCmpError
 
     if isinstance(error, AerpawCmpError):
@@ -166,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns
     -------
     int
-        The exit code; exceptions end here.
+        The exit code. Exceptions are caught here.
     """
     own_process = arguments is None  # NumPy is not loaded yet
     if own_process:
@@ -196,12 +196,12 @@ def main(arguments: list[str] | None = None) -> int:
     except Exception as error:
         code = _failed(error, debug, arguments)
     if own_process:
-        gc.freeze()  # the process ends and frees its memory: a last garbage collection would take 0.3 s
+        gc.freeze()  # skip the last garbage collection, which takes 0.3 s; the memory is freed when the process ends
     return _code_of_output(code)
 
 
 def _interrupted(interrupt: KeyboardInterrupt) -> int:
-    """Report stored results. Return 128 plus the number of the signal."""
+    """Report which results were stored, and return 128 plus the number of the signal."""
     from .common.errors import one_line
 
     by = interrupts.last()
@@ -224,7 +224,7 @@ def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
 
 
 def _code_of_output(code: int) -> int:
-    """Return the exit code after flushing standard output. A failure would otherwise be found at exit only."""
+    """Return the exit code after flushing standard output. Otherwise a failure would be found only at exit."""
     fault = interrupts.output_fault()
     if fault is None or code:
         return code

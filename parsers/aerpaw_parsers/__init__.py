@@ -1,4 +1,4 @@
-"""The log formats, one module each, and their catalogue ``READERS``, which aerpaw-cmp finds by its entry point.
+"""Readers of log formats, one module each, and their catalogue ``READERS``, which aerpaw-cmp finds by its entry point.
 
 A module contains its reader in ``READER``, or several readers in ``READERS``.
 """

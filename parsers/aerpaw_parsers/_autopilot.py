@@ -1,7 +1,7 @@
-"""The pose of an aircraft, from the messages of any autopilot.
+"""The pose of an aircraft from the messages of an autopilot.
 
-Positions have their own times; attitude and velocity are those of the message nearest in time. Heights are above the
-home at take-off, not above an earlier or later home.
+Records have the times of positions. Attitude and velocity come from the message that is nearest in time. Heights are
+above the home position at take-off, not above an earlier or later home.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _NEAR_S = 0.5
 
 @dataclass
 class Series:
-    """The messages of one kind: ``time_s`` of the autopilot (n,), their 0-based numbers, and columns (n,)."""
+    """The messages of one kind: ``time_s`` of the autopilot (n,), 0-based numbers of the messages, and columns (n,)."""
 
     time_s: FloatArray
     number: IntArray
@@ -41,7 +41,7 @@ class Series:
         return np.where(np.abs(self.time_s[best] - time_s) <= _NEAR_S, self.columns[name][best], np.nan)
 
 
-# Latest valid time [s]. Autopilots count from 1970 or from power-on; a later time is damaged and overflows in ns.
+# Latest valid time [s]. Autopilots count from 1970 or from power-on. A later time is damaged, and would overflow in ns.
 _MOST_S = 4e9
 
 NONE = Series(np.zeros(0), np.zeros(0, dtype=np.int64))
@@ -69,14 +69,14 @@ class Flight:
     attitude : Series
         ``roll_deg pitch_deg yaw_deg``.
     velocity : Series
-        ``velocity_north_mps`` and so on.
+        ``velocity_north_mps``, ``velocity_east_mps`` and ``velocity_down_mps``.
     fix : Series
         ``fix satellites``.
     utc_minus_clock_s : float or None
         See :func:`offset_s`.
     home : Series
-        ``altitude_m`` of home above sea level, each time that the log contains it. If home is known, altitudes of
-        positions are above sea level, else above home or above the first position.
+        ``altitude_m`` of the home position above sea level, each time that the log contains it. If home is known,
+        altitudes of positions are above sea level, else above home or above the first position.
     source : str
         Name of the program.
     name : str
@@ -112,7 +112,7 @@ def result(
     flights : list of Flight
         One or more flights, one per vehicle.
     messages : int
-        Number of intact messages; those in ``damaged`` are not counted.
+        Number of intact messages, without ``damaged``.
     damaged : list of RejectedLine
     radio : Series
         ``RSSI`` and ``RemRSSI`` of the telemetry radio, in the radio's steps.
@@ -191,13 +191,13 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)
 
 
-# Distance [m] between filter and receiver that is suspicious, because a filter follows the receiver within seconds, the
-# share of such positions that is reported, and the number of a 3-D fix.
+# Suspicious distance [m] between the position of the autopilot's filter and of its receiver (the filter follows the
+# receiver within seconds), the share of such positions that is reported, and the number of a 3-D fix.
 _APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
 
 
 def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> list[str]:
-    """Return a warning if the positions of the autopilot are far from those of its receiver."""
+    """Return a warning if the positions of the autopilot are far from the positions of its receiver."""
     fixed = flight.fix.near("fix", time_s) >= _FIX_3D
     there_n, there_e = (np.where(fixed, flight.fix.near(name, time_s), np.nan) for name in _pose.PLACE[:2])
     here_n, here_e = (values[name] for name in _pose.PLACE[:2])

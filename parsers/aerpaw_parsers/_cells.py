@@ -1,4 +1,4 @@
-"""Levels of several cells in one row of a log: a stream per cell, with the times when it served the phone."""
+"""Levels of several cells in one row of a log: a stream per cell, with the times at which the cell served the phone."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ import pandas as pd
 
 from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows, Stream, add_flag, counted, dictionary
 
-# RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
+# Lowest RSRP that phones write, and the plausible range. An RSRP outside it is a placeholder (2147483647, 0) or an
+# error.
 _END_DBM = -140.0
 _RANGE_DBM = (-170.0, -1.0)
 
 
-# The smallest number of rows that show a statistic, and the largest relative size of its steps.
+# Smallest number of rows in which a statistic can be recognised, and the largest ratio of its steps to the steps of the
+# level.
 _SHOWN_ROWS, _SMOOTHER = 12, 0.6
 
 
 def is_statistic_of(level: FloatArray, other: FloatArray) -> bool:
-    """Check whether a column is a running mean, minimum or maximum of a level: smoother, and near or at its end."""
+    """Check whether a column is a running mean, minimum or maximum of a level: smoother, and near it or its extreme."""
     both = np.isfinite(level) & np.isfinite(other)
     level, other = level[both], other[both]
     if len(level) < _SHOWN_ROWS or np.std(np.diff(other)) >= _SMOOTHER * np.std(np.diff(level)):
@@ -34,7 +36,7 @@ def is_statistic_of(level: FloatArray, other: FloatArray) -> bool:
 
 
 class Reading(NamedTuple):
-    """The levels of one cell in one row, a row of the table for :func:`streams`.
+    """The levels of one cell in one row, which is a row of the table for :func:`streams`.
 
     Parameters
     ----------
@@ -111,7 +113,7 @@ def streams(
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
-    # stable, so that the second of two readings of a row is flagged cell_twice
+    # use a stable sort, because the second of two readings of a row is flagged cell_twice
     table = table[np.isfinite(table["rsrp_dbm"].to_numpy(np.float64))].sort_values("row", kind="stable")
     table = table.assign(served=_serving(table), pci=table["pci"].where(table["pci"] >= 0, -1.0))
     per_cell, named = list[Stream](), bool(table["more"].ne("").any())
@@ -145,7 +147,7 @@ def _serving(table: pd.DataFrame) -> FloatArray:
     for rat in np.unique(rats[serving.astype(bool)]).tolist():
         of_rat = np.flatnonzero(rats == rat)
         named = of_rat[serving[of_rat].astype(bool)]
-        # all readings of a row at once, because neighbours may come before the serving cell
+        # look up all readings of a row at once, because neighbours may come before the serving cell
         last = np.searchsorted(row[named], row[of_rat], side="right") - 1
         of_rat, last = of_rat[last >= 0], last[last >= 0]
         served[of_rat] = serving[of_rat] | (cell[:, of_rat] == cell[:, named[last]]).all(axis=0)
@@ -167,7 +169,7 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
             "read as missing"
         )
-    # phones write the lowest value (3GPP TS 36.133, 9.1.4) if there is no signal; a weak cell approaches it gradually
+    # without a signal, phones write the lowest value (3GPP TS 36.133, 9.1.4); a weak cell would approach it gradually
     ends = (level == _END_DBM) & (about["quantity"] == "RSRP")
     if ends.any() and not ((level > _END_DBM) & (level < _END_DBM + 10.0)).any():
         outside |= ends
@@ -175,7 +177,7 @@ def _stream(rows: Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attr
         rows.warnings.append(f"{cell}: {levels} of {_END_DBM:g} dBm, none within 10 dB above: read as out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI is below RSRP, which is impossible: are the columns swapped?")
-    # a level that is too high, unlike a missing one, contains no information about coverage
+    # unlike a missing level, a level that is too high contains no information about coverage
     high = outside & (level > _RANGE_DBM[1]) & ~np.isin(level, (0.0, *dictionary.UNAVAILABLE))
     add_flag(flag, high, "level_out_of_range")
     add_flag(flag, outside & ~high, "out_of_coverage")
@@ -224,7 +226,7 @@ def named(
         quantity = replace(quantity, name="SNR", role="rss")
     short = re.sub(r"\W+", "_", dictionary.plain(name))
     direct = meaning is not None and not (meaning.indirect or meaning.place.startswith("n") or unit == "%")
-    # a power in dB has no reference, unlike a ratio
+    # unlike a ratio, a power in dB has no reference, so use the unit of the quantity
     unit = quantity.unit if (quantity.name, unit) == ("power", "dB") else unit
     if quantity.kind == "rss" and direct and "statistic" not in (about or {}):
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))

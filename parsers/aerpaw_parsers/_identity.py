@@ -19,7 +19,7 @@ from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows,
 
 from . import _sheet
 
-# A column with more values than this counts something: it does not name devices or networks.
+# A column with more values than this does not name devices or networks. It is probably a counter.
 _MOST_PARTS = 64
 # At a handover a program updates its columns one after the other. A value in at most this number of rows, and in at
 # most this share of the rows of the other columns' key, is such a delay.
@@ -41,7 +41,7 @@ def parts(
         Quantities of the dictionary, such as ``device`` or ``network``. The identity is the combination of all columns
         of these quantities.
     found : bool
-        Whether to look also for columns with unknown names that distinguish rows.
+        True if columns with unknown names that distinguish rows are also used.
     level : int, optional
         The column of levels, if its name does not show it.
 
@@ -96,7 +96,7 @@ def _values(texts: Mapping[int, list[str]]) -> dict[int, set[str]]:
 
 
 def _levels(sheet: _sheet.Sheet) -> AnyArray:
-    """Return for each row, as bytes, which levels, ratios and ranks it has. The bytes are empty if it has none."""
+    """Return for each row, as bytes, which levels, ratios and ranks it has. The bytes are empty if the row has none."""
     columns = [
         np.isfinite(sheet.numbers(i))
         for i, meaning in enumerate(sheet.meanings)
@@ -107,7 +107,7 @@ def _levels(sheet: _sheet.Sheet) -> AnyArray:
 
 
 def _with_level(sheet: _sheet.Sheet) -> BoolArray:
-    """Return the mask of the rows with a level, a ratio or a rank, or of all rows if no row has any."""
+    """Return the mask of the rows with a level, a ratio or a rank, or of all rows if there is no such row."""
     filled: BoolArray = _levels(sheet) != b""
     return filled if filled.any() else np.ones(len(sheet), dtype=bool)
 
@@ -118,7 +118,7 @@ def dividing_columns(texts: Mapping[int, list[str]], counts: BoolArray, base: Se
     Parameters
     ----------
     texts : mapping of int to list of str, length n
-        Texts of each column, empty where it names nothing.
+        Texts of each column, which are empty where the column names nothing.
     counts : bool array, shape (n,)
         Rows that are considered.
     base : sequence of str, length n, optional
@@ -140,7 +140,7 @@ def dividing_columns(texts: Mapping[int, list[str]], counts: BoolArray, base: Se
 
 
 def _is_divided(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
-    """Check whether a key has two values of a column, ignoring the few rows in which a program lags."""
+    """Check whether a key has two values of a column, except in the few rows in which a program lags."""
     totals, values = Counter[str](), Counter[str]()
     for (before, _), count in counts.items():
         totals[before] += count
@@ -153,7 +153,7 @@ def _is_divided(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
 
 
 def cell_columns(sheet: _sheet.Sheet, *, nr: bool | None = None) -> list[int]:
-    """Return the columns that are named like a cell and that the dictionary does not know, if possible of NR or not."""
+    """Return columns named like a cell that the dictionary does not know, if possible only of NR (``nr``) or of LTE."""
     columns = [
         i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and dictionary.names_a_cell(words, alone=True)
     ]
@@ -201,7 +201,7 @@ def _marks(rows: Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int
         found = []
     marks += found
     if key == "network" and unknown and level is not None:
-        # compare rows of one known key, because a cell number that belongs to one PCI adds no information
+        # compare rows of one known key, because a cell number adds no information if it has only one PCI
         same = _of_one_key(table.drop(columns=["time", "levels"]))
         part, time = sheet.part(same), rows.time[same]
         for i in unknown:
@@ -219,7 +219,7 @@ _ASKED = "not in a fixed order: does it name the device or cell of a row? If so,
 def _name_sources(table: pd.DataFrame, found: list[str], level: FloatArray | None) -> bool:
     """Check whether columns that distinguish rows of one time name sources, unlike a temperature or a counter.
 
-    Most sources have one row at each time, or the level of a source changes less than that between sources.
+    Either most sources have one row at each time, or the level changes less within a source than between sources.
     """
     key = [name for name in table if name not in ("time", "levels", *found)]
     groups = [group for _, group in table.groupby(key)] if key else [table]
@@ -247,7 +247,7 @@ _REPEATED, _MOST_MARKS, _MOST_DOUBLE = 0.3, 16, 0.1
 
 
 def few(texts: Iterable[str]) -> bool:
-    """Check whether a column has several values, but not more than a table has devices or cells."""
+    """Check whether a column has several values, but not more than the plausible number of devices or cells."""
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
@@ -284,14 +284,14 @@ _CODES = ("operator", "carrier", "provider", "plmn", "network", "mcc", "mnc", "q
 
 
 def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
-    """Return the texts of a column, empty where a text is not a name: a network 0 is not, but a device 0 is."""
+    """Return the texts of a column, empty where a text is not a name. 0 can name a device, but not a network."""
     meaning = sheet.meanings[column]
     code = meaning is not None and meaning.quantity.name == "network" and sheet.plain[column].startswith(_CODES)
     none = {*_sheet.NO_VALUE, *_NO_IDENTITY, *("0" if code else "")}
     written = sheet.texts(column)
     whole = {text: _FLOAT.sub(r"\1", text) for text in {*written}}
     texts = [whole[text] for text in written]
-    # 'lw1', 'LW1' and 'LW-1' are one tower, '3510 MHz' and '3.51 GHz' one carrier
+    # 'lw1', 'LW1' and 'LW-1' are the same tower; '3510 MHz' and '3.51 GHz' are the same carrier
     plain = {text: re.sub(r"(?<=[^\W\d])[-_ ](?=\d)", "", text.casefold()) for text in {*texts}}
     carriers = {text: attributes_of({sheet.plain[column]: text}).get("frequency_hz") for text in plain}
     plain |= {text: f"{hz:.9g}" for text, hz in carriers.items() if isinstance(hz, float)}
@@ -358,6 +358,6 @@ _NO_IDENTITY = ("2147483647", "4294967295", "268435455", "65535", "-1", "9223372
 
 
 def _label(name: str, value: str) -> str:
-    # a name begins with a letter: 'sim1', not '1'
+    # the name must begin with a letter, such as 'sim1' instead of '1'
     word = re.sub(r"\W+", "_", value).strip("_")
     return word if word[:1].isalpha() else name.partition(" ")[0] + word

@@ -1,4 +1,4 @@
-"""JSON lines: one object per line, with an account of all other lines."""
+"""JSON lines: one object per line. All other lines are counted."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Objects:
     rejected : list of RejectedLine
         Lines that are not objects.
     more : int array
-        0-based lines of objects over several lines, except the first line of each.
+        0-based lines of objects that span several lines, except the first line of each object.
     closed : bool
         True if all objects are in an array that ends on its line.
     """
@@ -44,7 +44,7 @@ class Objects:
 
 
 def objects(lines: Lines) -> Objects:
-    """Return the objects of a file, each on one line or over several lines.
+    """Return the objects of a file. An object may span several lines.
 
     A file may also be one JSON array of objects, on one line or with its brackets on separate lines. Commas at the end
     of lines are ignored.
@@ -84,7 +84,7 @@ def _loaded(text: bytes) -> tuple[Any, bool]:
     try:
         return json.loads(text), False
     except json.JSONDecodeError as error:
-        # an error at the end of the text: the rest may be on the next lines
+        # an error at the end of the text can mean that the object continues on the next lines
         return None, text.startswith(b"{") and error.pos >= len(error.doc)
     except (ValueError, RecursionError):
         return None, False
@@ -124,7 +124,7 @@ _ON_A_LINE = re.compile(rb"^(?:\xef\xbb\xbf)?[ \t\[]*\{", re.MULTILINE)
 
 
 def beginning(head: bytes) -> list[dict[str, Any]]:
-    """Return the first objects of a file for sniffers: those on its first lines, or one over several lines."""
+    """Return the objects on the first lines of a file for sniffers, or an object that spans several lines."""
     alone = (_loaded(_bare(line))[0] for line in head.split(b"\n")[:_ENTRIES])
     return [value for value in (*alone, first(head)) if isinstance(value, dict)]
 
@@ -141,7 +141,7 @@ def first(head: bytes) -> dict[str, Any] | None:
     return value if isinstance(value, dict) else None
 
 
-# Names of objects that only group values and do not describe them.
+# Names of objects that group values without a meaning of their own.
 _GROUPS = re.compile(
     r"(?:(?<=\.)|^)(?:(?:gps|gnss|pos(?:ition)?|loc(?:ation)?|coord(?:inate)?s?|geo|data|meta(?:data)?|info|sample|record"
     r"|measurement|_source|(?:decoded_?)?payload|fix|state|telemetry|uplink_?message|\w+_ids)\.)+"
@@ -197,7 +197,8 @@ def readings(entry: dict[str, Any]) -> list[dict[str, str]]:
 
 
 def _of_gateway(item: Mapping[str, str], roles: Mapping[str, str]) -> dict[str, str]:
-    # The Things Network writes the RSSI twice. The position and the clock of a gateway are not those of the device
+    # The Things Network writes the RSSI twice. position and clock of a gateway are not used, because they do not
+    # describe the device
     once = {name: text for name, text in item.items() if name != "channel_rssi" or "rssi" not in item}
     return {name if roles.get(name) in ("rss", "kpi") else f"gateway.{name}": text for name, text in once.items()}
 
@@ -224,7 +225,7 @@ def number(value: Any) -> float:
 
 
 def column(entries: Sequence[dict[str, Any]], *names: str) -> FloatArray:
-    """Return a value of every object as numbers, under the first of ``names`` that the object has."""
+    """Return a value of every object as a number, under the first of ``names`` that the object has."""
     return np.array([number(next((entry[name] for name in names if name in entry), None)) for entry in entries])
 
 
@@ -241,5 +242,5 @@ def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def bracket(line: bytes) -> str | None:
-    """Return the reason for lines that are not objects, or None for the brackets of an array."""
+    """Return why a line is not an object, or None for the brackets of an array."""
     return None if line.strip() in (b"[", b"]") else "not a JSON object"

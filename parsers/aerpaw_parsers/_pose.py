@@ -1,4 +1,4 @@
-"""Telemetry of tables with named columns: AERPAW's and others' autopilots, DJI, phones."""
+"""Telemetry from tables with named columns: autopilots of AERPAW and others, DJI, phones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MOST = 1e9
 def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
     """Return the telemetry stream of a table, or None if it has no position.
 
-    Rows without a position are omitted unless all rows are.
+    Rows without a position are omitted, except if no row has a position.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
     if coarse := whole_degrees([sheet.names[latitude], sheet.names[longitude]], values):
         raise _sheet.shifted(coarse, "positions")
     datum, height = _height(rows, sheet)
-    if datum not in ("take-off", "ground"):  # these come from a barometer and need no fix
+    if datum not in ("take-off", "ground"):  # such heights come from a barometer and need no fix
         height = np.where(unfixed, np.nan, height)
     values["altitude_m"] = height
     about: Height = {"height_from": rows.height_from}
@@ -76,12 +76,12 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
     values |= sheet.found(*VELOCITIES, "battery_v")
     for key, count in sheet.found("fix", "satellites").items():
         values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
-    where = None if lost.all() else written  # a row at 0, 0 is a reading without a fix
+    where = None if lost.all() else written  # a row at 0, 0 has no fix
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
 
 _PLACE = re.compile(r"\b(lat|latitude|lon|lng|long|longitude)\b")
-# A receiver at rest seems to move by less than this, about 20 m.
+# The positions of a receiver at rest vary by less than this (about 20 m).
 _AT_REST_DEG = 2e-4
 
 
@@ -96,7 +96,7 @@ def _alike(sheet: _sheet.Sheet, name: str) -> list[int]:
 
 
 def without_fix(sheet: _sheet.Sheet) -> BoolArray:
-    """Return the mask (n,) of the rows that any column about the fix marks as rows without a fix."""
+    """Return the mask (n,) of the rows without a fix according to any column about the fix."""
     unfixed = np.zeros(len(sheet), dtype=bool)
     for i, meaning in enumerate(sheet.meanings):
         name = "" if meaning is None else meaning.quantity.name
@@ -116,7 +116,7 @@ def without_fix(sheet: _sheet.Sheet) -> BoolArray:
             # MAVLink writes 1 without a fix and 3 with a fix; the quality of NMEA is 1 with a fix and never 3
             of_mavlink = re.search("type|status|mode", words) is not None and (values >= 3).any()
             none = values <= float(of_mavlink or ((values == 3).any() and "qual" not in words))
-        # a column that has this value in every row is not filled by the program
+        # if a column has this value in every row, the program does not fill the column
         if (values[~none] > 0).any():
             unfixed |= none
     return unfixed
@@ -138,7 +138,7 @@ def of_readings(
 
 
 def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:
-    """Return a clause that names the angle in whole degrees if exactly one of two is, else an empty text."""
+    """Return a clause that names the angle in whole degrees, if only one of two is. Otherwise the text is empty."""
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     # a receiver writes decimals even at rest; an index or a count does not
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
@@ -183,7 +183,7 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     home = next((i for i, words in enumerate(sheet.plain) if dictionary.PATTERNS["of_home"].fullmatch(words)), None)
     if datum in ("sea level", "unknown") and home is not None and (is_set := sheet.numbers(home) > UNSET_M).any():
         home_m, lowest_m = sheet.numbers(home)[is_set], np.nanmin(height, initial=np.inf)
-        # heights of an unknown datum may count from home already
+        # heights of an unknown datum may already be above home
         if datum == "sea level" or (lowest_m > home_m.min() - _REST_M and lowest_m > home_m.min() / 2):
             sheet.used.add(home)
             return "take-off", above_home(rows, time_s, height, time_s[is_set], home_m)
@@ -205,7 +205,8 @@ def _height(rows: Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
 _IMPERIAL = ("mph", "ft", "feet", "foot", "ft/s")
 # Home has moved if its altitude changes by more than ``MOVED_M``; an aircraft has taken off if it climbs by ``_OFF_M``.
 MOVED_M, _OFF_M = 0.5, 2.0
-# A home this close to sea level [m] is not set: the two heights of a record are then equal, except for rounding.
+# If home is within this distance of sea level [m], it is not set: both heights of a record are then equal after
+# rounding.
 UNSET_M = 0.01
 _UNSET = "home was not set in {}: these have no height, because the altitude jumps when home is set"
 
@@ -215,7 +216,7 @@ def above_home(
 ) -> FloatArray:
     """Return heights above the home at take-off, from altitudes above sea level of the aircraft and of home."""
     if (known_home := np.abs(home_m) > UNSET_M).any() and not known_home.all():
-        # before home is set, the autopilot reports the altitude of its filter as the height above home
+        # before home is set, the autopilot writes the altitude of its filter as the height above home
         home_s, home_m = home_s[known_home], home_m[known_home]
         begin = int(np.searchsorted(time_s, home_s[0]))
         step_m = altitude[begin - 1] - altitude[begin] if 0 < begin < len(altitude) else 0.0
@@ -247,13 +248,13 @@ def from_logged_heights(
     time_s, altitude, height, home_m : float array, shape (n,)
         Time, altitude above sea level, height above home, and altitude of home, which is the difference of the two.
     one_estimate : bool
-        True if both heights are known to be of one estimate.
+        True if both heights come from the same estimate.
 
     Returns
     -------
     float array, shape (n,), or None
-        Heights as logged if home never moved in one step. Home was never set if altitude and height are the same number
-        throughout and do not begin near zero.
+        Heights as logged if home never moved in one step. Home was never set if altitude and height are always equal
+        and do not begin near zero.
     """
     known = np.flatnonzero(np.isfinite(home_m))
     home_m = home_m[known]
@@ -267,15 +268,16 @@ def from_logged_heights(
     return above_home(rows, time_s, altitude, time_s[known], home_m)
 
 
-# Two heights of one estimate differ by a constant within this [m], except in the few rows in which home moves.
+# The difference of two heights of the same estimate varies by less than this [m], except in the few rows in which home
+# moves.
 _JITTER_M, _STEADY = 0.1, 0.9
 
 
 def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: BoolArray) -> tuple[FloatArray, Height]:
     """Return heights above take-off, and the attributes about their source.
 
-    Heights above sea level or an unknown datum count from the height at rest on the ground before the climb. A
-    hover does not count as rest. If there is no such rest, they count from the first position.
+    From heights above sea level or an unknown datum, the height at rest on the ground before the climb is subtracted. A
+    hover does not count as rest. If there is no such rest, the height of the first position is subtracted.
 
     Parameters
     ----------
@@ -292,7 +294,7 @@ def above_takeoff(rows: Rows, values: dict[str, AnyArray], datum: str, lost: Boo
     about: Height = {"height_from": rows.height_from, "height_datum": datum}
     possible = (altitude > _POSSIBLE_M[0]) & (altitude < _POSSIBLE_M[1])
     known = np.flatnonzero(possible & ~lost & ~astray(rows, values))
-    known = known[np.argsort(rows.time[known], kind="stable")]  # an export may begin with the newest row
+    known = known[np.argsort(rows.time[known], kind="stable")]  # exports may begin with the newest row
     seconds = np.maximum(np.diff(rows.time[known]) / np.timedelta64(1, "s"), 0.1)
     rate_mps = np.abs(np.diff(altitude[known])) / seconds
     if 2 * (rate_mps > _FASTEST_MPS).sum() > (rate_mps > 0).sum():
@@ -331,7 +333,7 @@ def astray(rows: Rows, values: Mapping[str, AnyArray]) -> BoolArray:
     return jumps_of(pd.DataFrame({"time": rows.time, "line": rows.row + 1, **place}))[0]
 
 
-# No small aircraft climbs faster than this [m/s].
+# Fastest climb of a small aircraft [m/s].
 _FASTEST_MPS = 60.0
 # Heights that begin within this distance of zero are relative to take-off.
 _NEAR_ZERO_M = 10.0
@@ -342,11 +344,11 @@ _DEGREE_M = 111_000.0
 
 
 def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatArray:
-    """Return altitudes with NaN for leading zeros if all other altitudes are far from 0: there was no fix yet.
+    """Return altitudes with NaN for leading zeros if all other altitudes are far from 0, because they have no fix.
 
     If times are given, as for an unknown datum, the step must also be faster than any climb.
     """
-    # argmax is also 0 if all heights are 0: nothing is removed
+    # if all heights are 0, argmax is 0 and nothing is removed
     begun = int(np.argmax(np.nan_to_num(altitude) != 0))
     if not begun or np.nanmin(np.abs(altitude[begun:])) < _NEAR_ZERO_M:
         return altitude
@@ -360,7 +362,7 @@ def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatAr
 def _without_unset_home(rows: Rows, height: FloatArray) -> FloatArray:
     """Return heights above take-off with NaN for leading altitudes above sea level, written before home was set.
 
-    Such altitudes are all far from 0, and the next height is near 0, farther below than any descent reaches.
+    Such altitudes are all far from 0, and the next height is near 0. No descent is so fast.
     """
     fall_m, step_s = -np.diff(height), np.abs(np.diff(rows.time) / np.timedelta64(1, "s"))
     falls = (fall_m > _NEAR_ZERO_M + _CLIMB_MPS * step_s) & (np.abs(height[1:]) < _REST_M)
@@ -432,7 +434,7 @@ def are_small(values: dict[str, FloatArray]) -> bool:
 def are_radians(values: dict[str, FloatArray]) -> bool:
     """Check whether roll, pitch and yaw are in the range of radians.
 
-    In degrees, a flight with such values would never turn by more than six degrees from north.
+    In degrees, such a flight would never turn more than six degrees away from north.
     """
     if set(values) != set(ANGLES) or not all(np.isfinite(value).any() for value in values.values()):
         return False

@@ -1,8 +1,8 @@
-"""Tables with a header and columns in any order, whose meaning is in the dictionary.
+"""Tables with a header and columns in any order. The dictionary contains the meaning of column names.
 
-The header may follow title lines, and its separator is that of the table. Decimal commas are read if the separator is
-another character. A header in the middle of the file begins a new table. Trailing cells that a program omits are read
-as empty. A table whose values are outside the ranges of the dictionary for its header is refused.
+The header may follow title lines. Its separator is also the separator of the rows. Decimal commas are read if the
+separator is another character. A header in the middle of the file begins a new table. Trailing cells that a program
+omits are read as empty. A table whose values are outside the ranges of the dictionary for its header is refused.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from aerpaw_cmp.readers import InputError, ReadOptions, RejectedLine, UsageError
 
 from . import _json, _stamps
 
-# Spaces are tried last: two or more between columns of fixed width, whose names may have several words, or one or more.
+# Spaces are tried last: first two or more spaces, as between columns of fixed width whose names may have several words,
+# and then a single space.
 SEPARATORS = (",", ";", "\t", "|", "  ", " ")
 # Largest number of lines before a header.
 TITLES = 60
@@ -39,7 +40,7 @@ _IsHeader = Callable[[list[str]], bool]
 
 
 def split_row(line: bytes, separator: str) -> list[str]:
-    """Split a line into fields, but not at separators inside quotes."""
+    """Split a line into fields at separators outside quotes."""
     text = decoded(line)
     if separator == "|" and text.startswith("|"):  # a table of Markdown
         text = text.strip("| ")
@@ -84,11 +85,11 @@ def header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, l
 
 
 def _is_even(lines: Sequence[bytes], separator: str) -> bool:
-    """Check whether most lines below a header of columns between spaces have as many fields as the header."""
+    """Check whether most lines below a header separated by spaces have as many fields as the header."""
     if b": " in lines[0]:  # keys and values, such as those of YAML
         return False
     width, *below = [len(_fields(line, separator)) for line in lines[:6] if line.strip()] or [0]
-    # R and pandas write no name above the numbers of rows
+    # R and pandas write row numbers without a column name
     return 2 * max(below.count(width), below.count(width + 1)) > len(below) and max(below) <= width + 1
 
 
@@ -105,7 +106,7 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     at, separator, names = header
     below = [(i, line) for i, line in enumerate(lines[at + 1 :]) if line.strip()]
     widths = [len(fields) for _, fields in islice(_logical(below, separator, len(names)), 5)]
-    # rows may omit their last cells, or have one more after a separator at their end
+    # rows may omit their last cells, or have an additional empty cell after a separator at their end
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
 
 
@@ -136,7 +137,7 @@ def _fix(text: str) -> str:
     return next((number for form, number in _FIXES if form.search(word)), text)
 
 
-# 35.728 N; N 35 43.68; degrees, minutes and seconds with their marks or colons.
+# Forms such as 35.728 N and N 35 43.68, and degrees, minutes and seconds with their marks or colons.
 _MARKS = "[\u00b0'\u2032\u2033\"dms: ]"
 _ANGLE = re.compile(rf"([NSEW]?) ?[-+]?[\d.]+(?:{_MARKS}{{1,3}}[\d.]+){{0,2}}{_MARKS}{{0,3}}([NSEW]?)")
 
@@ -240,13 +241,13 @@ class Sheet:
         said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
         known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
         rats = {i for i, what in enumerate(known) if what and what.quantity.name == "technology"}
-        # a column such as 'radio' may name receivers
+        # a column such as 'radio' may contain names of receivers
         unlike = {i for i in rats if not any(_ANY_RAT.search(row[i]) for row in self.cells[:200])}
         known = [None if i in unlike else what for i, what in enumerate(known)]
         # 'serving cell' may be a cell and not a state, 'satellite' a satellite and not their number
         for i, form in ((i, _NAMES_IN.get(what.quantity.name)) for i, what in enumerate(known) if what):
             known[i] = _NETWORK if form and any(form.match(row[i]) for row in self.cells[:200]) else known[i]
-        # names such as 'mode' and 'Giorno' do not show that the cells are radio accesses and dates
+        # names such as 'mode' and 'Giorno' do not prove that the cells are radio accesses and dates
         names = {what.quantity.name for what in known if what}
         for name, form in (("technology", _RAT), ("date", _DATE)):
             of_form = None if name in names else dictionary.meaning(name)
@@ -259,10 +260,10 @@ class Sheet:
         return bool(cells) and all(map(form.fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
-        """Return the column that fits one of the quantities best, an empty column only if there is no other.
+        """Return the column that fits one of the quantities best, or an empty column if there is no other.
 
         A height of 0 in all rows counts as empty. Of equally good columns, such as the positions of two receivers, a
-        column that was used before is better.
+        column that is already in use is preferred.
         """
         blank = " 0." if "altitude_m" in quantities else None
         known = [
@@ -286,7 +287,7 @@ class Sheet:
         return next((self._own.index(name) for name in names if name in self._own), None)
 
     def unit(self, column: int) -> str:
-        """Return the unit in the name of a column, or that of its program, or an empty text."""
+        """Return the unit in the name of a column, or the unit that its program uses, or an empty text."""
         what, unit, _ = self._described[1][column]
         if not unit and what is not None:
             unit = self._units.get("rss" if what.quantity.role == "rss" else self._own[column], "")
@@ -295,7 +296,7 @@ class Sheet:
 
     @cached_property
     def _units(self) -> dict[str, str]:
-        """The units of levels (key ``rss``) and of other columns, which a column such as ``alt unit`` contains."""
+        """The units of levels (key ``rss``) and of other columns, from columns of units such as ``alt unit``."""
         found = {}
         for i, name in enumerate(self._own):
             of_what = re.fullmatch(r"(?:(.*) )?units?", name)
@@ -306,7 +307,7 @@ class Sheet:
         return found
 
     def unit_read(self, column: int) -> str:
-        """Return the unit of :meth:`numbers`, empty if the brackets contain other text, such as ``(LTE scell0)``."""
+        """Return the unit of :meth:`numbers`. It is empty if brackets contain other text, such as ``(LTE scell0)``."""
         self.numbers(column)
         return dictionary.unit_of(self._cell_units.get(column) or self.unit(column))
 
@@ -321,7 +322,7 @@ class Sheet:
         return bool(len(values) and (np.abs(values) > 1e5).mean() > 0.5 and (values == np.round(values)).all())
 
     def silence(self, where: BoolArray, columns: Iterable[int]) -> None:
-        """Empty the cells of some rows."""
+        """Make the cells of some rows empty."""
         for column in columns:
             for cells in compress(self.cells, where.tolist()):
                 cells[column] = ""
@@ -348,7 +349,7 @@ class Sheet:
     def numbers(self, column: int) -> FloatArray:
         """Return a column as read-only numbers in the unit of the dictionary, NaN for missing values.
 
-        Levels and positions keep the numbers that mean a missing value, because their records are flagged.
+        In levels and positions, numbers that mean a missing value are not replaced, because their records are flagged.
         """
         if column not in self._numbers:
             values = self._parsed(column, self.texts(column))
@@ -457,7 +458,7 @@ class Sheet:
         if gains:
             text = "changes, and levels are not corrected for it: do they already include it?"
             said.append(f"column {self.names[gains[0]]!r} {text}")
-        # a long log may have many comments between its rows
+        # use only comments near the table, because a long log may have many comments between its rows
         near = (i for i in self.blank_rows.tolist() if len(self) and (i < TITLES or 0 < i - self.row[-1] <= TITLES))
         beside = {i + 1: self.lines.text(i).strip('#%;" ') for i in near}
         said += [
@@ -495,7 +496,8 @@ class Sheet:
             return False
         if not all(text.isdecimal() for text in texts):
             return all(_LETTER.search(text) and math.isnan(_number(text)[0]) for text in texts)
-        # unlike waypoints and heights, numbers of cells are neither consecutive nor round; unlike counts, they are few
+        # unlike waypoints and heights, cell numbers are neither consecutive nor round; unlike counters, they have few
+        # values
         numbers = np.unique([int(text) for text in texts])
         called = dictionary.has("called", self.plain[column])
         like = called or (np.diff(numbers).min(initial=2) > 1 and (numbers % 5).any() and self.find("PCI") is None)
@@ -505,7 +507,7 @@ class Sheet:
 
 
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
-# Largest share of rows that are equal to another row: rows within one second may be equal.
+# Largest share of rows that are equal to another row. Rows of the same second may be equal.
 _MOST_EQUAL = 0.3
 _YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
 # Names contain a letter. A column with more different texts or numbers than this does not name cells or devices.
@@ -601,7 +603,7 @@ def _split_places(sheet: Sheet) -> None:
 def of_readings(
     lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
 ) -> Sheet:
-    """Return the table of readings without a separator. All other lines are comments unless they are rejected.
+    """Return a table of readings that are not separated columns. All other lines are comments unless they are rejected.
 
     Parameters
     ----------
@@ -645,7 +647,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     first = "".join(row[0].strip() for _, row in written[:3] if len(row) == len(names) + 1 and row[-1].strip())
     if first in ("123", "012"):
         names = ["", *names]
-    # a row of several lines counts once: its other lines count as comments
+    # a row that spans several lines counts once, and its other lines count as comments
     comments = [*range(at + 1), *sorted({*numbers} - {i for i, _ in written})]
     header, rows, begun = _Header(_unique_names(names, group)), list[_Row](), False
     for i, fields in _without_empty_end(written, names):
@@ -653,7 +655,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
         valued = any(map(_VALUE.match, words))
         units = not begun and header.adds_units(words)
         if units or (not valued and header.is_header(words)):
-            comments.append(i)  # units below the names, or the header of a file that was appended
+            comments.append(i)  # units below the names, or the header of an appended file
             continue
         rows.append(_Row(i, len(fields), len(header.place), header.placed(words)))
         # a line of descriptions may precede that of the units
@@ -681,7 +683,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
 
 
 class _Row(NamedTuple):
-    """A row of a table: its 0-based line, its number of fields, that of its header, and its cells."""
+    """A row of a table: its 0-based line, its number of fields, the number of fields of its header, and its cells."""
 
     line: int
     fields: int
@@ -713,7 +715,7 @@ def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> 
 
 
 def _unique_names(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
-    """Return the names of a header as unique names, by adding the text of merged cells above them, or a number."""
+    """Make the names of a header unique by adding the text of merged cells above them, or a number."""
     counts, before = Counter(names), Counter[str]()
     unlike, above = [], ""
     for i, name in enumerate(names):
@@ -747,7 +749,7 @@ class _Header:
         return True
 
     def is_header(self, texts: list[str]) -> bool:
-        """Check whether a line is a header, perhaps with other columns, and apply it to the lines below."""
+        """Check whether a line is a header, perhaps with other columns. If so, use it for the lines below."""
         texts = _unique_names(texts)
         bare = [dictionary.without_unit(text) for text in texts]
         both = zip(bare, texts, strict=True)
@@ -782,7 +784,7 @@ class _Header:
 
 
 def _whole_rows(rows: list[_Row], names: list[str], last_line: int) -> list[_Row]:
-    """Return the rows as wide as their header, and shorter rows if the program often writes such rows."""
+    """Return the rows that are as wide as their header, and shorter rows if the program often writes them."""
     full = [row for row in rows if row.fields == row.width]
     short = [row for row in rows if 1 < row.fields < row.width]
     # a single short row is truncated, and the last line may be cut short in every file
@@ -793,7 +795,7 @@ def _whole_rows(rows: list[_Row], names: list[str], last_line: int) -> list[_Row
 
 
 def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
-    """Check whether a short row is truncated: it has half a position, or a value that its column cannot have."""
+    """Check whether a short row is truncated: it has half a position, or a value that is impossible in its column."""
     place = {"latitude_deg": False, "longitude_deg": False}
     for text, meaning in zip(cells, meanings, strict=False):
         if meaning is None:
@@ -812,7 +814,7 @@ def _without_empty_end(rows: list[tuple[int, list[str]]], names: list[str]) -> l
     Most rows must have this field: an unquoted decimal comma also adds a field, and shifts the columns.
     """
     longer = [not fields[-1].strip() for _, fields in rows if len(fields) == len(names) + 1]
-    filled = longer.count(False)  # one or two truncated rows may have a further field, too
+    filled = longer.count(False)  # one or two truncated rows may also have a further field
     if 2 * longer.count(True) > len(rows) and filled <= max(1, len(rows) // 100):
         more = len(names) + 1
         rows = [(i, row[:-1] if len(row) == more and not row[-1].strip() else row) for i, row in rows]
@@ -914,7 +916,7 @@ def _to_utc(timed: Rows, sheet: Sheet, column: int | None) -> None:
 
 
 def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None:
-    """Return the best column of times: UTC rather than local, and not the time of the last fix, which may stop."""
+    """Return the best column of times: UTC if possible, and not the time of the last fix, which may stop."""
     column = sheet.find("time")
     # a column with an unknown name is a clock if its cells contain dates and times of day
     dated = {i for i, text in enumerate(sheet.cells[0]) if _CLOCK.match(text)} if sheet.cells else {}
@@ -935,7 +937,7 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
         return column
     rest = [i for i in ranked if i != column]
     if not (texts == texts.shift()).any():
-        some = sheet.part(np.arange(len(sheet)) % (1 + len(sheet) // 500) == 0)  # enough rows for a median
+        some = sheet.part(np.arange(len(sheet)) % (1 + len(sheet) // 500) == 0)  # sufficient for a median
         own = _instants(some, column, options)
         for i in rest if len(own) else ():
             apart = _instants(some, i, options) - own
@@ -951,17 +953,17 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
 
 
 def _is_dated(sheet: Sheet, column: int) -> bool:
-    """Check whether the times of a column have a date, their own or that of a column of dates."""
+    """Check whether the times of a column include a date or can use a column of dates."""
     first = next(filter(None, sheet.texts(column)), "")
     return _stamps.is_dated(first) or (":" in first and sheet.find("date") is not None)
 
 
-# A clock has stopped if another clock advances by more than this while it shows one time [s].
+# A clock has stopped if another clock advances by more than this while its time does not change [s].
 _STANDS_S = 2.0
 
 
 def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: ReadOptions) -> bool:
-    """Check whether a column of times advances while another column shows one time."""
+    """Check whether a column of times advances while the time in another column does not change."""
     run = (standing != standing.shift()).cumsum().to_numpy()
     time = pd.Series(_instants(sheet, column, options, dated=standing.nunique() > 1))
     spans = time.groupby(run).agg(["min", "max"])
@@ -973,7 +975,7 @@ _APART_S = 2.0
 
 
 def _instants(sheet: Sheet, column: int, options: ReadOptions, *, dated: bool = True) -> AnyArray:
-    """Return a column of times in UTC, all NaT if it cannot be read, or if it must be dated and is not."""
+    """Return a column of times in UTC. All are NaT if the column cannot be read, or has no required date."""
     none = np.full(len(sheet), np.datetime64("NaT", "ns"))
     try:
         clock, cells, _ = _times(sheet, column, options, mapped=False)
@@ -1054,7 +1056,7 @@ def _devices(sheet: Sheet) -> IntArray | None:
 
 
 def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options: ReadOptions) -> tuple[str, list[str]]:
-    """Return the zone in a column of zones, or an empty zone and the times with their zones if there are several."""
+    """Return the zone in a column of zones, or an empty zone and the times with appended zones if there are several."""
     cells, name = sheet.texts(column), f"column {sheet.names[column]!r}"
     known = {text: "" if text.lower() in _NO_ZONE else _stamps.zone_of_cell(text) for text in cells}
     word = next(filter(None, known.values()), "")
@@ -1081,7 +1083,7 @@ _CLOCK = re.compile(r"\d{4}-\d\d-\d\d.\d\d:\d\d")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 # A cell of a column that contains only AM or PM.
 _AM_PM = re.compile(r"[AaPp]\.?[Mm]\.?")
-# The order in a name: 'date (dd/mm/yyyy)'.
+# The order of day and month in a column name such as 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 
@@ -1096,7 +1098,7 @@ def unread_levels(sheet: Sheet) -> list[int]:
     named = [
         i for i in unknown
         if sheet.unit_read(i) in _OF_LEVELS and (sheet.names[i] in like or _has_levels(sheet, i))
-        # a level in dBm is negative: other numbers are percentages or steps
+        # levels in dBm are negative; other numbers are percentages or steps
         and (sheet.unit_read(i) == "dB" or np.nanmedian(sheet.numbers(i)) < 0)
     ]  # fmt: skip
     return sorted(named, key=lambda i: (dictionary.is_statistic(sheet.names[i]), sheet.unit(i) != "dbm"))
@@ -1119,7 +1121,7 @@ def way_to_level(sheet: Sheet) -> list[str]:
 
 
 def _has_levels(sheet: Sheet, column: int) -> bool:
-    """Check whether the numbers of a column look like levels in dBm, such as those of a column named by a tower."""
+    """Check whether the numbers of a column look like levels in dBm. The column may be named after a tower."""
     known = sheet.numbers(column)[np.isfinite(sheet.numbers(column))]
     like = len(known) > 1 and (known < -30).mean() > 0.9 and known.min() > -150
     return bool(like and not dictionary.has("unlike_a_level", sheet.plain[column]))
@@ -1141,13 +1143,13 @@ def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
             expected="weeks since 1980, such as 2370",
             cause="the receiver counts them modulo 1024: add 1024 or 2048 to the column",
         )
-    # a week has 604 800 s: larger counts are milliseconds
+    # a week has 604 800 s, so larger numbers are milliseconds
     scale = 1e-3 if np.nanmax(seconds) > 604_800 else 1.0
     return np.asarray(weeks * 604_800.0 + seconds * scale + _stamps.GPS_S - _stamps.LEAP_S)
 
 
 def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
-    """Refuse a table whose rows are shifted against its header, according to the ranges of the dictionary.
+    """Refuse a table whose rows are shifted against its header, as shown by the ranges of the dictionary.
 
     Raises
     ------
@@ -1158,7 +1160,7 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
     if not wrong or not len(wrong[0][1]):
         return
     count = np.sum([mask for *_, mask in wrong], axis=0)
-    # a few impossible rows are damaged; more of them mean that the columns are shifted
+    # a few impossible rows are damaged rows; if there are more, the columns are shifted
     few = max(3, len(count) // 20)
     alone = [
         mask
@@ -1173,7 +1175,7 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
 
 
 def _refuse_positions_elsewhere(sheet: Sheet) -> None:
-    """Refuse a table whose positions are in other columns than those named as positions."""
+    """Refuse a table whose positions are not in the columns that are named as positions."""
     names = {i: what.quantity.name for i, what in enumerate(sheet.meanings) if what is not None and not what.indirect}
     place = [i for i, name in names.items() if name in ("latitude_deg", "longitude_deg")]
     astray = [i for i in place if np.isfinite(sheet.numbers(i)).sum() > 2 and not _is_place(sheet.numbers(i))]
@@ -1189,7 +1191,7 @@ def _refuse_positions_elsewhere(sheet: Sheet) -> None:
 def _is_place(values: FloatArray) -> bool:
     """Check whether numbers can be an angle of positions of one flight: close together, and not all whole degrees.
 
-    A leg due north has one longitude, perhaps with few decimals.
+    On a leg due north the longitude is constant, perhaps with few decimals.
     """
     known = values[np.isfinite(values)]
     near = len(known) and np.ptp(known) < NEAR_DEG and 1 < np.abs(known).max() <= 180
@@ -1199,19 +1201,19 @@ def _is_place(values: FloatArray) -> bool:
 def _is_angle(values: FloatArray) -> bool:
     """Check whether numbers look like positions of one flight: close together, with four or more decimals."""
     known = values[np.isfinite(values)]
-    # more than three decimals: a thousandth of a degree is 100 m, too coarse for any receiver
+    # require more than three decimals, because 0.001 deg is 100 m, which is too coarse for any receiver
     return _is_place(values) and bool((np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
 
 
 def shifted(found: str, expected: str) -> InputError:
-    """Return the error for a table whose values are in columns with other names."""
+    """Return the error for a table whose values are in the wrong columns."""
     return InputError(f"the rows do not fit the header: {found}", expected=expected, cause=MISALIGNED)
 
 
 MISALIGNED = "a column is missing in the header or in the rows, so that values are under the wrong names"
 
 
-# Whole seconds and a counter that belong together differ by less than 1 s, plus 0.5 s for rounding.
+# Largest difference between whole seconds and a counter of the same clock: 1 s, plus 0.5 s for rounding.
 _MOST_APART_NS = 1_500_000_000
 # Half of the range of a time stamp.
 _MOST_NS = 2.0**62
@@ -1228,7 +1230,7 @@ def _add_milliseconds(rows: Rows, milliseconds: FloatArray) -> None:
     fits = np.abs(counted_ns).max() < _MOST_NS
     counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
     zero = (time - counted)[known]
-    counts_on = ((np.diff(time) > 0) & (np.diff(counted) > 0)).any()  # fractions begin again with each second
+    counts_on = ((np.diff(time) > 0) & (np.diff(counted) > 0)).any()  # fractions would begin again with each second
     spread = zero.max() - zero.min()
     if fits and 0 <= counted.min() <= counted.max() < 1_000_000_000 and not (counts_on and spread <= _MOST_APART_NS):
         rows.time = (time + counted).astype("datetime64[ns]")

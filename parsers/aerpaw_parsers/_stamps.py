@@ -1,8 +1,8 @@
 """Conversion of dates and times in any form to ``YYYY-mm-dd HH:MM:SS.f``, with the zone if there is one.
 
-All readers and ``--map`` use this parser. The zone is that in the cell, else that in the name of the column, else the
-user's. The complete column decides whether ``03/04/2025`` is in March or April. If this is undecided, an order
-is assumed and a warning reports it.
+All readers and ``--map`` use this parser. The zone is taken from the cell, else from the name of the column, else from
+the user. The complete column decides whether ``03/04/2025`` is in March or April. If this is undecided, an order is
+assumed and a warning reports it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.readers import AnyArray, FloatArray, InputError, IntArray, ReadOptions, UsageError, dictionary
 
 _NAMED_ZONE = r"Z|[A-Z][A-Za-z]+/[A-Z][\w/]+|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
-# Java writes the place after the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
+# Java writes the name of the zone after the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
 _PLACE = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
-# AM and PM have the position of a zone, but are not a zone.
+# AM and PM are at the position of a zone, but are not a zone.
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
     r"(?P<hour>\d{1,2})[:.h_-](?P<minute>\d\d)(?:[:.m_-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,40}))?s?)?(?: Uhr)?"
@@ -57,14 +57,14 @@ def _forms() -> tuple[re.Pattern[str], ...]:
 
 
 _OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h_-]", ":", 1).replace("[:.m_-](?P<second>", ":(?P<second>") + _ZONE)
-# Python, pandas and C print up to 17 digits (0.30000000000000004), programs with decimal arithmetic more.
+# Python, pandas and C print up to 17 digits (0.30000000000000004). Programs with decimal arithmetic print more.
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?")
-# An epoch shortened by a spreadsheet, ``1.74093E+12``: fewer than nine digits after the first omit seconds.
+# An epoch shortened by a spreadsheet, ``1.74093E+12``: if fewer than nine digits follow the first, seconds are lost.
 _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
 # A time as a spreadsheet shows it: minutes, seconds and tenths without the hour.
 _MINUTES = re.compile(r"\d{1,2}:\d\d[.,]\d")
 _COMMON = re.compile((_text.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
-# Dates with or without hyphens, and Nemo's: its summary of the log ``24Feb09`` contains the date ``2024 Feb 09``.
+# Dates with or without hyphens, and dates in the form of Nemo: ``24Feb09`` is 9 February 2024.
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
@@ -101,7 +101,7 @@ def _month(word: str) -> int:
     return 0 if known is None else known.lastindex or 0
 
 
-# Two orders of the same dates are distinguished if their spans differ by this number of days.
+# Two orders of day and month are distinguished if the spans of the dates differ by this number of days.
 _WEEKS_D = 20
 
 
@@ -120,14 +120,14 @@ def _order(
         warnings.append(f"the years have two digits: the {word} number is assumed to be the year, a guess")
         if year_first:
             return "ymd", warnings
-    # 02.03.2025: with points, the day comes first
+    # with points, as in 02.03.2025, the day comes first
     if all(match["mark"] == "." for match in dates) or max(firsts) > 12:
         return "dmy", warnings
     if max(seconds) > 12:
         return "mdy", warnings
     if day_first is not None:
         return "dmy" if day_first else "mdy", warnings
-    # days of a log that passes midnight follow each other in one order and are weeks apart in the other
+    # after midnight, the days of a log follow each other in the right order, and are weeks apart in the wrong order
     spans_d = {}
     for order in ("dmy", "mdy"):
         parts = [_parts(match, order) for match in {match.group("a", "b", "c"): match for match in dates}.values()]
@@ -171,7 +171,7 @@ def _match(text: str) -> re.Match[str] | None:
     return next(known, None)
 
 
-# AT+CCLK of a modem: the zone counts quarters of an hour (3GPP TS 27.007, 8.15).
+# Time of a modem (AT+CCLK), whose zone is in quarters of an hour (3GPP TS 27.007, 8.15).
 _OF_MODEM = re.compile(r"(\d\d/\d\d/\d\d,\d\d:\d\d:\d\d[+-])(\d\d)")
 
 
@@ -221,7 +221,7 @@ def _offset(zone: str, date: str, own: str | None) -> str:
     try:
         moment = datetime.fromisoformat(date)
     except ValueError:
-        return ""  # the date does not exist, which the caller reports
+        return ""  # the caller reports that the date does not exist
     if own and (here := _at(own, moment)) is not None and here[1] == word:
         return _shown(here[0])
     if word in _WITH_SUMMER or "/" in word:
@@ -312,7 +312,7 @@ def zone_of_cell(text: str) -> str:
         word = text.upper() if text.upper() in {*_HOURS, *dictionary.WINTER, *_WITH_SUMMER} else text
         return word if re.fullmatch(_NAMED_ZONE, word) and ("/" not in word or _at(word, datetime.min)) else ""
     hours = float(text)
-    # zones are at most 14 h from UTC: larger numbers are minutes (840) or seconds
+    # zones are at most 14 h from UTC, so larger numbers are minutes (up to 840) or seconds
     hours /= 1 if abs(hours) <= 14 else 60 if abs(hours) <= 840 else 3600
     return _shown(hours)
 
@@ -336,7 +336,7 @@ def read(
     gps : bool
         True if numbers are GPS time according to the name of the column.
     day_first : bool, optional
-        The order of dates according to the name of the column.
+        True if the day comes before the month according to the name of the column.
     device : int array, shape (n,), optional
         Number of the device that wrote each row; midnights are found per device.
 
@@ -358,7 +358,7 @@ def read(
     shown = [_OF_MODEM.sub(_with_hours, text) for text in shown] if of_modem else shown
     filled = [text for text in shown if text]
     compact = [match for text in filled if (match := _COMPACT.fullmatch(text))]
-    # in counts of seconds these digits reach 60 to 99, in times of the day they never do
+    # these digits reach 60 to 99 in numbers of seconds, but never in times of day
     clocks = len(compact) == len(filled) and all(len({match[part] for match in compact}) > 1 for part in (6, 7))
     if 2 * sum(clocks or bool(match[1] or zone) for match in compact) > len(filled):
         shown = [_COMPACT.sub(_with_marks, text) for text in shown]
@@ -385,7 +385,7 @@ def read(
 
 
 def _doubts_of_halves(texts: Sequence[str], options: ReadOptions, zone: str) -> list[str]:
-    """Return a sentence about local times that a clock of 12 hours without AM and PM may have written."""
+    """Return a warning about local times that may come from a 12-hour clock without AM and PM."""
     # texts of another form have a zone, or AM and PM
     plain = bool(texts) and not zone and options.clock != "utc" and _PLAIN_CLOCK.fullmatch(texts[0])
     hours = [int(found[1]) for text in texts if (found := _PLAIN_CLOCK.fullmatch(text))] if plain else [0]
@@ -396,7 +396,7 @@ def _doubts_of_halves(texts: Sequence[str], options: ReadOptions, zone: str) -> 
     return [f"{what}: a clock of 12 hours without AM and PM? Write hours from 0 to 23, or add AM or PM to the times"]
 
 
-# A time without a zone, and the last hour of a night without flights.
+# A time without a zone, and the hour before which there are usually no flights.
 _PLAIN_CLOCK, _NIGHT_H = re.compile(r"[^:]*?(\d{1,2}):\d\d(?::[\d.,]+)?"), 5
 
 
@@ -460,15 +460,15 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
             raise InputError(f"the times are {found}, such as {shortened[0]}", expected=expected, cause=cause)
 
 
-# The longest flight [s], the longest step between its rows [s], and, for each unit, the smallest step that numbers
-# without a unit may have. Steps of 10 may be 10 ms, steps of 5 are 5 s.
+# Longest flight [s], longest step between its rows [s], and for each unit the smallest step of numbers without a stated
+# unit. Steps of 10 may be 10 ms, but steps of 5 must be 5 s.
 _FLIGHT_S, _LONGEST_STEP_S = 10_800.0, 60.0
 _LEAST_STEPS = {"s": 0.0, "ms": 10.0, "us": 2e3, "ns": 2e6}
-# A log that is shorter than this if its numbers are seconds may be in minutes or hours [s].
+# If numbers in seconds would be a log shorter than this [s], they may be minutes or hours.
 _SHORT_S = 60.0
-# Time steps of stationary loggers [s]. No program writes rows that are this many milliseconds apart.
+# Time steps of stationary loggers [s]. No program writes rows with steps of so many milliseconds.
 _QUARTERS = (900.0, 1800.0, 3600.0)
-# No program of a radio or an autopilot writes rows that are closer in time than this [ns].
+# Shortest time between rows that a program of a radio or an autopilot writes [ns].
 _LEAST_NS = 1e6
 
 
@@ -500,7 +500,7 @@ def _numbers(
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     step, likely = _step(value), _likely_units(value, _LEAST_STEPS)
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
-        # 0.9e9 s is July 1998: smaller numbers, and those with steps of odd hours, count from another origin
+        # 0.9e9 s is July 1998; smaller numbers, and numbers with steps of odd hours, have another origin
         hours = step / scale * 1e9 / 3600
         odd = unit is None and bool(likely) and hours > 1 and hours % 1 > 0
         if middle >= 0.9 * scale and not odd and (unit is None or scale >= _text.COUNTS[unit].least_epoch):
@@ -516,7 +516,7 @@ def _numbers(
     if unit is not None:
         return f"relative_{unit}", value, []
     whole, of_day = not (value % 1 > 0).any(), 86_400 < middle < 86_400_000
-    late = whole and middle > 86_400  # more seconds than a day has
+    late = whole and middle > 86_400  # more seconds than in a day
     unit = next((unit for unit in likely if unit != "s" or not late), "ms" if late and of_day and not likely else "s")
     unit = "s" if step in _QUARTERS and not (value % step).any() else unit
     # a log that is shorter than a minute in seconds may be in minutes or hours
@@ -556,7 +556,7 @@ def _lasting(value: FloatArray, unit: str) -> str:
 
 # GPS time counts from 6 January 1980; since 2017 it is 18 s ahead of UTC (IERS Bulletin C 52).
 GPS_S, LEAP_S = 315_964_800, 18
-# Scales of time without leap seconds, and how far they are ahead of UTC since 2017 [s].
+# Time scales without leap seconds, with their difference from UTC since 2017 [s].
 SCALES_S = {"gpst": LEAP_S, "gpstime": LEAP_S, "tai": 37}
 # GPS time of January 2018 and of February 2030. Read as epochs, they are in 2008 and 2020.
 _GPS_S_OF = (1.2e9, 1.58e9)
@@ -589,7 +589,7 @@ def _of_day(
     matches = [_OF_DAY.fullmatch(text) for text in texts]
     seconds = np.array([_seconds(item.groupdict()) if item else np.nan for item in matches], dtype=np.float64)
     # A step back by more than half a day is midnight; a smaller step back means that the clock was set. A step forward
-    # by more than half a day to the first row of another device returns to the day before.
+    # by more than half a day, at the first row of another device, goes back to the day before.
     step = np.nan_to_num(np.diff(seconds, prepend=np.nan))
     other = np.zeros(len(step), dtype=bool) if device is None else np.diff(device, prepend=device[:1]) != 0
     seconds += 86_400.0 * (np.cumsum(step < -43_200) - np.cumsum((step > 43_200) & other))
@@ -599,7 +599,7 @@ def _of_day(
     own_form = written == "Z" and any(text.startswith("T") for text in texts[:3])  # the form of Nemo Handy
     if not own_form or not len(first):
         return _on_a_date(seconds, options, _doubts_of_halves(texts, options, written), written)
-    # Nemo Handy marks its local times as UTC, and some exports are off by hours: its summary contains the start
+    # Nemo Handy marks its local times as UTC, and some exports are wrong by hours, so use the start in its summary
     hours = 0 if start_s is None else round((float(first[0]) - start_s) / 3600)
     name_s = int(named[1]) * 3600 + int(named[2]) * 60 + int(named[3]) if named else float(first[0])
     if start_s is None and abs(float(first[0]) - name_s) > _NEAR_S:

@@ -3,8 +3,8 @@
 The format describes itself: every message begins with A3 95 and its number, and ``FMT`` messages contain the length and
 columns of each. In text, each message is a line, ``NAME, value, value``. The messages ``POS`` (else ``GPS``), ``ATT``,
 ``XKF1`` or ``NKF1`` (velocity), ``GPS`` (UTC, fix), ``BAT`` and ``RAD`` (levels of the telemetry radio) are read.
-Heights are above home at take-off (``RelHomeAlt``), else above the ground at rest or the first position.
-Source: ArduPilot ``libraries/AP_Logger/LogStructure.h``.
+Heights are above home at take-off (``RelHomeAlt``). If home is unknown, they are above the ground at rest or the first
+position. Source: ArduPilot ``libraries/AP_Logger/LogStructure.h``.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _form(body: bytes) -> tuple[int, _Form]:
     return kind, _Form(length, texts[0], texts[1], texts[2].split(","))
 
 
-# Number and values of each message, by its name and columns: a log may describe a name more than once.
+# Number and values of each message, by its name and columns: a log may describe the same name several times.
 _Rows = dict[str, dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]]]
 
 
@@ -91,7 +91,7 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
 
 
 def _text_messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
-    """Return the same as :func:`_messages` for a log in text, where a line is a message with scaled values."""
+    """Return the same as :func:`_messages` for a log in text, in which each line is a message with scaled values."""
     columns: dict[str, tuple[str, ...]] = {}
     by_name: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []
@@ -152,7 +152,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     place = series["POS"] if len(series["POS"].time_s) else gps
     if "Lat" not in place.columns or "Lng" not in place.columns:
         place = _autopilot.Series(gps.time_s[:0], gps.number[:0], {"Lat": gps.time_s[:0], "Lng": gps.time_s[:0]})
-    names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # a receiver with one antenna has no yaw
+    names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # a receiver with a single antenna has no yaw
     position = _named(place, *(name for name in names if name in place.columns))
     position.columns.setdefault("altitude_m", np.full(len(place.time_s), np.nan))
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
@@ -164,7 +164,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _named(series: _autopilot.Series, *names: str) -> _autopilot.Series:
-    """Return messages with the columns of the record model, from all columns or the named ones."""
+    """Return messages with the columns of the record model, from all columns or from the named columns."""
     fields = {name: series.columns[name] for name in names or series.columns}
     return _autopilot.Series(series.time_s, series.number, dictionary.record_columns(fields, of=("TimeUS",)))
 
@@ -172,7 +172,7 @@ def _named(series: _autopilot.Series, *names: str) -> _autopilot.Series:
 def _offset(gps: _autopilot.Series) -> float | None:
     if "GWk" not in gps.columns or "GMS" not in gps.columns:
         return None
-    # week 1000 is March 1999: a receiver without time writes 0 or counts modulo 1024
+    # week 1000 is March 1999; a receiver without time writes 0, or weeks modulo 1024
     known = gps.columns["GWk"] > 1000
     utc_s = _autopilot.gps_utc_s(gps.columns["GWk"][known], gps.columns["GMS"][known])
     return _autopilot.offset_s(utc_s, gps.time_s[known])

@@ -1,7 +1,7 @@
 """AERPAW's cell search: ``Found CELL MHz, 3500.0, EARFCN, 7399, PHYID, 1, ... PSS power dBm, -30.1, PSR, 2.3, <time>``.
 
-The console and the table of srsRAN's program, as modified by AERPAW, have a line per cell and sweep. The time of a line
-is at its end (with milliseconds after a colon, or in the form of ``asctime``) or at its beginning, from ``ts``.
+The console and the table of srsRAN's program, as modified by AERPAW, contain a line per cell and sweep. The time of a
+line is at its end (with milliseconds after a colon, or in the form of ``asctime``) or at its beginning, from ``ts``.
 
 The level is the power of the synchronisation signal, not an RSRP. There is a series per PCI and EARFCN.
 """

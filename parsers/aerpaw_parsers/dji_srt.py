@@ -36,7 +36,7 @@ def _reading(text: bytes) -> dict[str, str]:
         cells[_NAMES.get(name.decode(), name.decode())] = value.decode()
     if (place := _GPS.search(text)) is not None:
         longitude, latitude = place[1].decode(), place[2].decode()
-        # some firmware writes the latitude first, which shows as a latitude beyond 90 degrees
+        # some firmware writes the latitude first; a latitude above 90 degrees shows that both are swapped
         swapped = abs(float(latitude)) > 90
         cells |= {"latitude": longitude if swapped else latitude, "longitude": latitude if swapped else longitude}
     if (date := _DATE.search(text)) is not None:

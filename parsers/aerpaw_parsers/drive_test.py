@@ -1,4 +1,4 @@
-"""Tables with named columns: exports of drive-test programs, phones, autopilots and DJI, with one dictionary for all.
+"""Tables with named columns: exports of drive-test programs, phones, autopilots and DJI. All use the same dictionary.
 
 The name of a column contains its quantity (RSRP, RSRQ, PCI, ARFCN, rank, ...), the radio access (LTE, NR) and the role
 of the cell (serving, or the n-th neighbour). Levels with a PCI become one stream per cell, such as ``lte_pci110``; its
@@ -31,7 +31,7 @@ from . import _cells, _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel
 _IsHeader = Callable[[list[str]], bool]
 # A tower of AERPAW in the name of a column, and its channel.
 _TOWER = re.compile(r"\b(lw|cc) ?([1-5])\b(?: ?(usrp) ?(\d)\b)?")
-# Values with which the columns "serving", "neighbouring" and "technology" mark a cell that does not serve.
+# Values with which the columns "serving", "neighbouring" and "technology" mark cells as not serving or serving.
 _NO, _YES = ("false", "0", "no", "", "n/a", "none", "null", "nan", "-"), ("true", "1", "yes")
 _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
 
@@ -56,7 +56,8 @@ def has_radio(names: list[str]) -> bool:
 
 
 def _quantities(names: list[str]) -> set[str]:
-    # sniffers test every line at the beginning of a file: few lines are those of a program with its own words
+    # sniffers test every line at the beginning of a file, so use the slower ``described`` only for headers of known
+    # programs
     of_program = dictionary.program([*map(dictionary.plain, names)]) is not None
     known = [what for what, *_ in dictionary.described(names)[1]] if of_program else map(dictionary.meaning, names)
     return {what.quantity.name for what in known if what is not None}
@@ -68,7 +69,7 @@ def _has_time(names: list[str]) -> bool:
     return bool(known & {"time", "date"} or {"gps_week", "gps_seconds"} <= known or _sheet.has_date_in_parts(names))
 
 
-# Readers of specific tables that pass the same test. They know units that are not in the names.
+# Readers of specific tables that pass the same test. These readers know units that are not in the names.
 _NARROWER = (nemo_csv, quectel_ri, ardupilot_bin, rtklib_pos, vehicle_out)
 
 
@@ -104,7 +105,7 @@ class _Cell:
 
 
 _IDENTITY, _PCI = ("pci", "arfcn"), next(row for row in dictionary.QUANTITIES if row.name == "PCI")
-# Columns are separate series if they repeat a cell of their row in more than this share of the rows.
+# Columns become separate series if they repeat a cell of the same row in more than this share of the rows.
 _TWICE = 0.3
 # Prefixes of places with a secondary carrier, which is always a separate cell.
 _SECONDARY = ("scell", "secondary")
@@ -150,7 +151,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
             cell.columns["rsrp_dbm"], cell.quantity = cell.columns.pop("rssi_dbm"), "RSSI"
     if sheet.find("neighbouring") is not None and (common := cells.get(("", "serving"))) is not None:
         of_row = {name: column for name, column in common.columns.items() if name in _IDENTITY}
-        for cell in cells.values():  # one cell per row: the identity belongs to any level of the row
+        for cell in cells.values():  # with one cell per row, the identity applies to all levels of the row
             cell.columns = {**of_row, **cell.columns}
     placed = _completed(cells, others)
     if len(placed) == 1:
@@ -187,8 +188,8 @@ def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
     """Return the cells with a level, and add identities without a radio access to the only cell with their role.
 
-    Neighbours without a radio access in their names get that of the table, if there is only one. Levels of neighbours
-    without a PCI become KPIs.
+    Neighbours without a radio access in their names get the radio access of the table if there is only one. Levels of
+    neighbours without a PCI become KPIs.
     """
     for (rat, role), cell in list(cells.items()):
         if "rsrp_dbm" in cell.columns:
@@ -200,7 +201,7 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             homes = [home for home in levels.values() if home.place[0] != "n" and (not rat or home.rat in ("", rat))]
         if {*cell.columns} == {"arfcn"} and role == "serving" and not homes:
             homes = [home for home in levels.values() if not rat or home.rat in ("", rat)]
-            for home in homes:  # the carrier of a scan belongs to all cells of the row
+            for home in homes:  # the carrier of a scan applies to all cells of the row
                 home.columns = {**cell.columns, **home.columns}
         elif len(homes) == 1:
             (home,) = homes
@@ -230,7 +231,7 @@ def _readings(
         level = sheet.numbers(cell.columns["rsrp_dbm"])
         values = {name: _or_nan(sheet, cell.columns.get(name), len(level)) for name in _FIELDS.values()}
         none = np.isnan(values["rsrp_dbm"]) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
-        # a table with mostly impossible numbers was refused before: such a number here is a single damaged cell
+        # tables with mostly impossible numbers were refused above, so an impossible number is a single damaged cell
         pci = np.where(dictionary.impossible(_PCI, values["pci"]), np.nan, values["pci"])
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {
@@ -249,10 +250,10 @@ def _readings(
 def _marked(readings: pd.DataFrame) -> pd.DataFrame:
     """Return readings whose ``more`` contains an identity other than the PCI, or else the column of the level.
 
-    Next to a PCI, such an identity counts only if one PCI has two of them.
+    If there is a PCI, such an identity is used only if one PCI has two of them.
     """
     known, marks = readings["pci"].notna(), readings["mark"]
-    # carriers of one mast often have one PCI, and two phones one cell
+    # carriers of a mast often share a PCI, and two phones may share a cell
     cell = ["row", "rat", "pci", "arfcn", "mark"]
     twice = readings.assign(arfcn=readings["arfcn"].fillna(-1)).duplicated(cell, keep=False)
     share = (twice & known).groupby(readings["carrier"]).mean()
@@ -369,7 +370,7 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     identities = [sheet.texts(serving[name]) for name in _IDENTITY if name in serving]
     base = ["\t".join(row) for row in zip(*identities, strict=True)] or [""] * len(sheet)
     about: dict[str, dict[str, Attribute]] = {}
-    # 'cell_id' next to 'nr_cell_id' is the identity of the LTE cell
+    # if there is an 'nr_cell_id', 'cell_id' is the identity of the LTE cell
     more = [_identity.cell_names(sheet, base, about, nr=nr) for nr in (False, True)]
     owned: dict[tuple[str, ...], list[_Cell]] = {}
     for cell in cells:
@@ -394,11 +395,11 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     ranks = [i for i in ranks if not _numbers_cells(rows, sheet, i)]
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]
-    # without a level or rank, the ratio to the noise is the receiver's level
+    # without a level or rank, the ratio to the noise is used as the level
     alone = not {"rss", "rank"} & {*direct} and not _of_a_scheduler(rows, sheet) and not _sheet.unread_levels(sheet)
     shown: list[Stream | None] = []
     for i in columns:
-        # a rank next to levels is that of the serving cell, which changes
+        # in a table with levels, the rank belongs to the serving cell, which changes
         of_cells = "rss" not in direct if i in ranks else _is_level(sheet, i, alone)
         parts = _identity.parts(rows, sheet, *_keys(sheet, i), found=False) if of_cells else [("", rows, sheet)]
         for label, part, inner in parts:
@@ -444,7 +445,7 @@ def _of_a_scheduler(rows: Rows, sheet: _sheet.Sheet) -> bool:
 
 
 def _numbers_cells(rows: Rows, sheet: _sheet.Sheet, column: int) -> bool:
-    """Check whether the ranks at most times are 1, 2, 3 ..: an order of cells, such as that of a scanner."""
+    """Check whether the ranks at most times are 1, 2, 3 ..: an order of cells, such as the order of a scanner."""
     table = pd.DataFrame({"time": rows.time, "rank": sheet.numbers(column)}).dropna()
     of_time = table.groupby("time")["rank"].agg(["size", "nunique", "min", "max"])
     listed = (of_time["size"] > 1) & (of_time[["nunique", "max"]].eq(of_time["size"], axis=0)).all(axis=1)
@@ -465,7 +466,7 @@ def _short(sheet: _sheet.Sheet, column: int) -> str:
     return "_".join(_SHARED.sub(" ", sheet.plain[column]).split()) or f"column{column + 1}"
 
 
-# Words that the names of several levels of one cell share, and further words for a measured level.
+# Words that the names of several levels of a cell have in common, and other words for a measured level.
 _SHARED = re.compile(r"\b(\w*rsrp|dbm|lte|nr|4g|5g|serving)\b")
 _MORE = re.compile(rf"{_SHARED.pattern}|\b(rssi|raw|meas(ured)?|inst|cell|ss|current)\b")
 
@@ -491,14 +492,14 @@ def _name_others(rows: Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: li
         if m and m.quantity.role == "rss" and m.place in _UNNAMED and not (m.indirect or _part(sheet, i)):
             alike.setdefault((m.quantity.name, m.rat), []).append(sheet.names[i])
     for names in alike.values():
-        # a header may have one name twice: the second of them is called "RSRP 2"
+        # if a header repeats a name, the second column is called "RSRP 2"
         if len(names) > 1 and not all(re.search(r"\d", name) for name in names):
             text = "are separate series: the table does not specify whose levels they are"
             rows.warnings.append(f"{' and '.join(map(repr, names))} {text}")
 
 
 def _assumed_units(sheet: _sheet.Sheet) -> Iterator[str]:
-    """Yield a sentence about each level without a unit that may have another unit than the one assumed."""
+    """Yield a sentence about each level without a unit if the assumed unit may be wrong."""
     levels = [i for i, what in enumerate(sheet.meanings) if what and what.quantity.role == "rss" and not what.indirect]
     for i in levels if not sheet.program else ():
         what, known = sheet.meanings[i], sheet.numbers(i)[np.isfinite(sheet.numbers(i))]
@@ -509,7 +510,7 @@ def _assumed_units(sheet: _sheet.Sheet) -> Iterator[str]:
             yield f"column {sheet.names[i]!r}: {text}. If this is wrong, use --unit"
 
 
-# The median RSSI of a receiver in the field is lower [dBm].
+# A higher median RSSI is not plausible for a receiver in the field [dBm].
 _NEAR_FULL_SCALE = -25.0
 
 
@@ -557,7 +558,7 @@ def _rank(rows: Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     none = (ri == 0) & (not zero)
     values = {"rank": checked_ranks(ri + zero, flag, none=none, means=True), "ri_raw": ri}
     name, cqi = re.sub(r"\W+", "_", sheet.plain[column]), sheet.find("CQI")
-    # a row without a report has no CQI either, and such rows are few; ranks that count from 0 have many zeros
+    # rows without a report have no CQI either, and are few, whereas ranks that count from 0 are often 0
     doubtful = none if cqi is None else none & (sheet.numbers(cqi) > 0)
     few = _MOST_IDLE * len(ri) if cqi is None else none.sum() / 2
     if doubtful.sum() > max(few, 1) and np.nanmax(ri, initial=0) < _MOST_PORTS:
@@ -580,7 +581,7 @@ def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream 
     if tower and tower[3]:
         about["channel"] = f"{tower[3]}{tower[4]}".upper()
     if meaning is not None and meaning.place.startswith("cell") and "cell" in name:
-        # 'cell 2 rsrp' is another cell, whereas 'rsrp 2' is a second reading of one cell
+        # 'cell 2 rsrp' belongs to another cell, whereas 'rsrp 2' is a second level of the same cell
         about |= {"cell": meaning.place, "part": meaning.place}
     if tower and name == f"snr {tower[0]}":
         return snr_stream(rows, about["node"], values)

@@ -1,15 +1,16 @@
 """Merged MATLAB flights: telemetry and level of each channel in one table, as their authors publish them.
 
-Dataset 12 has ``mpower1 mpower2`` (channels USRP1, USRP2), and AFAR's exp-288 files ``mpower mquality``. Both have
-``mX mY mZ`` (longitude, latitude, height above take-off) and ``mRoll mPitch mYaw`` in degrees. Their two clocks are
-``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, **local wall clock stored as if it were UTC**.
+Dataset 12 has ``mpower1 mpower2`` (channels USRP1, USRP2), and AFAR's exp-288 files ``mpower mquality``. Both have ``mX
+mY mZ`` (longitude, latitude, height above take-off) and ``mRoll mPitch mYaw`` in degrees. Their two clocks are
+``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, which is **local wall clock stored as if it were
+UTC**.
 
 The LTE flights have ``RSRP RSRP2 RSRQ RSSI`` and ``mX mY mZ``, with ``timestamp_for_csv`` (text, local) and
 ``timestamp_meas``, which **is UTC** and is used. No cell was decoded where ``succes`` is 0: ``RSRP2`` is then -60, and
 the other levels are -inf. Levels are dB re full scale (the authors subtract 98 dB for dBm).
 
-Processed files (``lat_s lon_s height_s RSRP_s ori_s``; ``lat_all lon_all h_all power_all ori_all``) have no clock: rows
-are timed at the sample rate of the raw logs, from 1970. The lines of the account are rows.
+Processed files (``lat_s lon_s height_s RSRP_s ori_s``; ``lat_all lon_all h_all power_all ori_all``) have no clock.
+Their times begin at 1970 and have the sample rate of the raw logs. The lines of the account are rows.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _UTC, _DECODED = "timestamp_meas", "succes"
 # Level variables of files without a clock, and the time between rows of the raw flights [s].
 _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
 _NAMES = {*_TELEMETRY, *_LEVELS, *_TEXTS, *_EPOCHS, "mSpeed"}
-# Names that only a flight has.
+# Names that occur only in files of flights.
 _SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
 # Raw positions, with which files of LTE flights begin; they identify the format, but only interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
@@ -49,7 +50,7 @@ _TEXT = re.compile(_text.TIME)
 def sniff(head: bytes) -> bool:
     """Check whether a file is a MATLAB file whose first variables are those of a merged flight.
 
-    A 7.3 file may have its names anywhere: only names in the sniffed bytes are tested.
+    In a file of version 7.3, names may be anywhere. Only names in the sniffed bytes are tested.
     """
     if head.startswith(MAGIC_73):
         return any(re.search(rb"\b%s\b" % name.encode(), head) for name in _SURE)
@@ -77,7 +78,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
             epoch = _numeric(table[name], name)
             # numbers below 1e8 are day numbers of MATLAB, or seconds of a clock that was never set
             valid = np.isfinite(epoch) & (epoch > 1e8) & (epoch < 9.2e9)
-            # double precision resolves 2.4e-7 s here, so microseconds are exact enough
+            # double precision resolves 2.4e-7 s here, so round to microseconds
             wall = np.round(np.where(valid, epoch, 0) * 1e6).astype(np.int64) * 1000
         if valid.any() or name in _EPOCHS:
             return wall, valid, name

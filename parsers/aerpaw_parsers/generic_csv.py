@@ -22,9 +22,9 @@ from aerpaw_cmp.readers import COLUMNS, Kind, Reader, ReadOptions, ReadResult, R
 from . import _identity, _pose, _sheet
 
 _EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
-# Further columns of ranks and levels: the positions of a table merged by hand are its track.
+# Further columns of ranks and levels. Positions in a manually merged table become the track.
 _COMPANIONS: dict[str, tuple[str, ...]] = {"rank": _EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
-# Required columns of each kind.
+# Columns that each kind requires.
 _VALUE = {"telemetry": _pose.PLACE, "rss": ("rss_db",), "rank": ("ri_raw",)}
 
 # Units of record columns, by the ends of their names.
@@ -64,7 +64,7 @@ def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -
     Raises
     ------
     UsageError
-        If the unit in the file belongs to another quantity than that of the mapping.
+        If the unit in the file does not fit the mapped quantity.
     """
     values, unit = sheet.numbers(column), sheet.unit_read(column)
     meaning, written = sheet.meanings[column], sheet.names[column]
@@ -128,7 +128,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     # the header is the line with the columns that the user named, else the first line
     header_of = _sheet.header_of(head, are_named) or _sheet.header_of(head, lambda _names: True)
     at, separator, header = header_of or (0, ",", [lines.text(first)])
-    # proposed options name columns with the unit of the line below the header
+    # options proposed by a draft may include the unit from the line below the header
     bare = {key: name if name in header else _UNIT.sub("", name) for key, name in options.columns.items()}
     options = replace(options, columns=bare) if {*bare.values()} <= {*header} else options
     kind, where = _checked(options, header)
@@ -160,7 +160,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         divided = _identity.parts(of_device, table, *_KEYS, level=level) if kind != "telemetry" else whole
         for label, part, cells in divided:
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
-            # all cells of a device have one zero of heights
+            # all cells of a device share the zero of heights
             of_part = None if heights is None else heights[np.searchsorted(of_device.row, part.row)], about
             streams.append(_stream(part, cells, kind, where, words, options.unit or unit, of_part))
         track = {name: column for name, column in where.items() if name in COLUMNS["telemetry"]}
@@ -176,7 +176,7 @@ _OF_LONG_TABLES = ("rss", "kpi", "rank", "position", "height")
 
 
 def _refuse_other_numbers(sheet: _sheet.Sheet, column: int, options: ReadOptions) -> None:
-    """Refuse powers without a unit as levels, and rows of several quantities that another column names."""
+    """Refuse powers without a unit as levels, and tables in which another column names the quantity of each row."""
     for i in range(len(sheet.names)):
         texts = {*sheet.texts(i)}
         named = sorted(texts) if _identity.few(texts) else []
@@ -191,7 +191,7 @@ def _refuse_other_numbers(sheet: _sheet.Sheet, column: int, options: ReadOptions
         raise InputError(found, expected=expected, cause="linear powers")
 
 
-# Heights above take-off, None if they stay as they are written, and the attributes about their source.
+# Heights above take-off (None if they are not changed), and the attributes about their source.
 _Heights = tuple[FloatArray | None, _pose.Height]
 
 
@@ -231,7 +231,7 @@ def _stream(
     else:
         place = {key: values[key] for key in _pose.PLACE if key in values}
         latitude, longitude, *altitude = place.values()
-        # loggers write -999 if there is no fix, here with a margin for rounding
+        # loggers write -999 if there is no fix; allow for rounding
         lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & np.all([m > -998.5 for m in altitude], axis=0))
         add_flag(flag, lost, "no_fix")
         values |= {key: np.where(lost, np.nan, column) for key, column in place.items()}

@@ -1,7 +1,7 @@
 """G-NetTrack's KML: a placemark per reading, its quantities as ``<Data name="RSRP"><value>-81</value></Data>``.
 
-The names are those of the program's text log, in capitals, and are read in the same way. The file is read by patterns
-and not by an XML parser, for the reason in :mod:`.nemo_kml`.
+The names are the same as in the program's text log, but in capitals, and are read in the same way. The file is read by
+patterns and not by an XML parser, for the reason in :mod:`.nemo_kml`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _reading(text: bytes) -> dict[str, str]:
         mode = _MODE.search(text)
         height = "Altitude AGL" if mode is not None and mode[1] == b"relativeToGround" else "Altitude above sea level"
         if not place[2].strip(b"0.") or (mode is not None and mode[1].startswith(b"clamp")):
-            place[2] = b""  # the point is drawn on the ground and has no height
+            place[2] = b""  # remove the height, because the point is drawn on the ground
         values |= {name: cell.decode() for name, cell in zip((*_PLACE, height), place, strict=True) if cell}
     return values
 

@@ -1,9 +1,9 @@
 """GPX tracks of phones, loggers and Nemo: ``<trkpt lat lon><ele><time>``.
 
-The file is read by patterns and not as XML: a parser that resolves entities is a risk with an untrusted file.
-Elements and attributes inside a point, such as those of its extensions, are columns of a table: levels among them are
-read. Nemo Handy writes times of the day without a date (``T14:13:17.853Z``), local in spite of the Z: their date is
-that of the file name. Elevations become heights above the first point.
+The file is read by patterns and not as XML: a parser that resolves entities is a risk with an untrusted file. Elements
+and attributes inside a point, such as those of its extensions, become columns of a table, from which levels are read.
+Nemo Handy writes times of the day without a date (``T14:13:17.853Z``), which are local in spite of the Z. The date is
+taken from the file name. Elevations become heights above the first point.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ def _points(data: bytes) -> list[tuple[int, dict[str, str]]]:
     """Return the place in the file and the cells of each complete point."""
     points, tracked = [], b"<trkpt" in data
     for point in _POINT.finditer(data):
-        # a point that contains the start of another is truncated; if there is a track, single points are only markers
+        # omit a point that contains the start of another, because it is truncated, and single points next to a track
+        # (markers)
         if _START.search(point[2]) or (tracked and b"trkpt" not in point[0]):
             continue
         found = [*_PAIR.findall(point[1]), *_INSIDE.findall(point[2])]
@@ -71,7 +72,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
     parts = {"": (rows, sheet)}
-    # tracks that run at the same time are those of several devices
+    # tracks with overlapping times come from several devices
     spans = sorted((rows.time[track == i].min(), rows.time[track == i].max()) for i in np.unique(track))
     if any(start < end for (_, end), (start, _) in pairwise(spans)):
         parts = {f"_{i}": (rows.part(track == i), sheet.part(track == i)) for i in np.unique(track).tolist()}

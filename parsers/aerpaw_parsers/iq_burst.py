@@ -18,7 +18,7 @@ _NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether its first variables are samples and device times."""
+    """Check whether the first variables of a file are samples and device times."""
     return head.startswith(MAGIC) and "IQ" in names_of(head)
 
 
@@ -48,7 +48,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = built(split(b"\n"), np.zeros(1, dtype=np.int64), {"time": np.array([text])}, options, reader="iq_burst")
     if not len(rows):
         return rows.result([])
-    with np.errstate(all="ignore"):  # damaged samples may be any number
+    with np.errstate(all="ignore"):  # damaged samples may have any value
         power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
     streams = []
     about: dict[str, Attribute | None] = {"frequency_hz": options.frequency_hz or float(named[1])}

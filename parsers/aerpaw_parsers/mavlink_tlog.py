@@ -2,7 +2,7 @@
 
 The messages GLOBAL_POSITION_INT (33: position, height above home, velocity, heading), ATTITUDE (30), GPS_RAW_INT
 (24: fix) and SYS_STATUS (1: battery) are read. Only the component that sends the positions of a vehicle is read,
-because the attitude of a gimbal is not that of the aircraft. Checksums are checked. Source: MAVLink guide, "Packet
+because a gimbal also sends its attitude. Checksums are checked. Source: MAVLink guide, "Packet
 Serialization".
 """
 
@@ -18,7 +18,7 @@ from aerpaw_cmp.readers import Reader, ReadOptions, ReadResult, RejectedLine, di
 from . import _autopilot
 
 _POSITION, _ATTITUDE, _GPS, _STATUS = 33, 30, 24, 1
-# MAVLink's CRC_EXTRA: a hash of the fields, so that a message of another layout fails the checksum.
+# MAVLink's CRC_EXTRA: a hash of the fields. With it, a message of another layout fails the checksum.
 _EXTRA = {_POSITION: 104, _ATTITUDE: 39, _GPS: 24, _STATUS: 124}
 _LAYOUT = {
     _POSITION: struct.Struct("<IiiiihhhH"), _ATTITUDE: struct.Struct("<Iffffff"), _GPS: struct.Struct("<QiiiHHHHBB"),
@@ -78,7 +78,7 @@ _Message = tuple[int, tuple[int, int], float, tuple[float, ...]]
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether the first three packets follow each other."""
+    """Check whether the first three packets follow each other without a gap."""
     at = 0
     for _ in range(3):
         packet = _packet(head, at)
@@ -118,7 +118,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _next_mark(data: bytes, at: int) -> int:
-    """Return the next place where a packet could begin, eight bytes before a mark."""
+    """Return the next position at which a packet can begin, eight bytes before a start mark."""
     places = [place for mark in (b"\xfe", b"\xfd") if (place := data.find(mark, at + 9)) >= 0]
     return min(places) - 8 if places else len(data)
 

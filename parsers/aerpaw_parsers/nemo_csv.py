@@ -1,7 +1,7 @@
 """CSV of a Keysight Nemo phone: ``index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi``.
 
-Times are milliseconds relative to an origin that is not in the file. The rank is that of the scheduled PDSCH and counts
-from one. Most rows have only a rank, or only RSRP, SINR and CQI. These three are also separate streams.
+Times are milliseconds relative to an origin that is not in the file. The rank is the rank of the scheduled PDSCH,
+counted from one. Most rows have only a rank, or only RSRP, SINR and CQI. RSRP, SINR and CQI are also separate streams.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _streams(rows: Rows) -> Iterator[Stream | None]:
     levels = [
         _cells.named(rows, name, values[column], where=np.isfinite(values[column]), about={"rat": "nr"})
         for column, name in _LEVELS
-    ]  # before pdsch_rank flags rows without a rank
+    ]  # read before pdsch_rank, which flags rows without a rank
     place = {name: values[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")}
     track = rows.stream("telemetry", "phone", place, where=np.isfinite(place["latitude_deg"]), source="Nemo rows")
     yield pdsch_rank(rows, dict(values))

@@ -1,7 +1,7 @@
 """Measurements of a Keysight Nemo phone, as KML: one placemark description per report, one quantity per file.
 
-Only the description lines are read, each with one report. They are read by patterns and not as XML, because a parser
-that resolves entities is a risk with an untrusted file. All other lines are markup and count as comments.
+Only the description lines are read. Each contains one report. They are read by patterns and not as XML, because a
+parser that resolves entities is a risk with an untrusted file. All other lines are markup and count as comments.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray) -> bool:
-    """Check whether times called milliseconds are seconds: the phone would be too fast in ms, but not in s."""
+    """Check whether times called milliseconds are in fact seconds: the phone would be too fast in ms, but not in s."""
     if not len(time_ms):
         return False
     speed_mps = typical_speed_mps(time_ms / 1e3, rough_m(latitude, longitude, (latitude[0], longitude[0])))

@@ -1,8 +1,8 @@
 """NMEA 0183 sentences of a GNSS receiver.
 
-Positions are those of ``GGA``, ``GNS`` or ``RMC``, dates those of ``RMC``, else of ``ZDA``. Times are UTC. A sentence
-is read if its checksum is right. Text in front of the ``$``, such as a logger's own time, is not read. The fix is that
-of MAVLink: 3 single, 4 differential, 5 and 6 RTK. Altitudes are above mean sea level.
+Positions come from ``GGA``, ``GNS`` or ``RMC``, and dates from ``RMC`` or ``ZDA``. Times are UTC. A sentence is read if
+its checksum is right. Text in front of the ``$``, such as a logger's own time, is not read. The fix has MAVLink's
+numbers: 3 single, 4 differential, 5 and 6 RTK. Altitudes are above mean sea level.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d(?:\.\d{1,9})?)")
 _DATE = re.compile(r"(0[1-9]|[12]\d|3[01])(0[1-9]|1[0-2])(?:20)?(\d\d)")
 # MAVLink's number of the fix, by the quality of GGA, the mode of GNS and the status of RMC.
 _FIX = dict(zip("0VN1A2D3P4R5F", "0003344336655", strict=True))
-# Kinds with positions, the preferred last: RMC has no height.
+# Kinds with positions, in rising order of preference, because RMC has no height.
 _PLACED = ("RMC", "GNS", "GGA")
 _PLACE = ("latitude [ddmm.mmmm]", "lat dir", "longitude [ddmm.mmmm]", "lon dir")
 

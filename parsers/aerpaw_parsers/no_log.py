@@ -1,4 +1,4 @@
-"""Known files that are not logs but are stored with logs, so that the account of a folder names each of its files.
+"""Known files that are not logs but are stored with logs, so that the list of files in a folder is complete.
 
 Each entry of ``no_log.yaml`` is a reader without kinds: its sniffer recognises the file, and its title describes it.
 These readers are tried if no reader of logs recognises the content.

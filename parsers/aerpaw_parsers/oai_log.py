@@ -2,7 +2,7 @@
 
 gNB: ``UE 1f4d: CQI 15, RI 2, PMI (14,1)`` or ``... CSI [CQI 15 RI 2 PMI (14,1)] SRS [...]``, and ``UE RNTI 1f4d ...
 average RSRP -78 (16 meas)``. UE: ``RI = 2 i1 = 0.0.0, i2 = 1, SINR = 20 dB, CQI = 15`` with or without ``RSRP = -80
-dBm,`` in front. All three add one to the index of the report before they print it: RI counts from one. A gNB prints
+dBm,`` in front. All three forms print the index of the report plus one, so RI counts from one. A gNB prints
 the last report, not a mean.
 
 The time is a stamp of ``ts``, or in srsRAN's form, at the beginning of the line or of a line above it. Without stamps,
@@ -38,7 +38,7 @@ _FRAMES_S = 1.28
 def sniff(head: bytes) -> bool:
     """Check whether a file is output of OAI with CSI or levels."""
     if not any(word in head for word in (b"MAC]", b"PHY]", b"Frame.Slot", b"dlsch_rounds", b"i1 = ")):
-        return False  # this test is a thousand times faster than the expressions
+        return False  # this test is a thousand times faster than the patterns
     return any(pattern.search(head) for pattern in (_CSI, _LEVEL, _UE)) and re.search(
         rb"\[(?:NR_)?(?:MAC|PHY)\]|Frame\.Slot|dlsch_rounds|\bi1 = ", head
     ) is not None  # fmt: skip

@@ -19,10 +19,10 @@ from . import _cells, _json, _pose
 
 _MARKS = (b'"cells"', b'"latitude"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
 
-# A line with a second START has a truncated reading and one of another time.
+# A line with a second START contains a truncated reading, followed by a reading at another time.
 _TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),(?:(?!CELL_LOG_START).)*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(rb"BS_INFO_START,([^\n]*?),?BS_INFO_STOP")
-# Places of the fields in a block, by technology, if all quantities are switched on in the app (its default).
+# Indices of the fields in a block, by technology, if all quantities are enabled in the app (the default).
 _OF_TEXT = {
     b"4G_LTE": {"fields": 19, "connected": 1, "rsrp": 6, "rsrq": 7, "rssi": 8, "sinr": 5, "arfcn": 11, "pci": 12},
     b"5G_NR_SA": {"fields": 19, "connected": 2, "rsrp": 7, "rsrq": 8, "sinr": 9, "arfcn": 13, "pci": 14},
@@ -114,7 +114,7 @@ def _placed(rows: Rows, latitude: FloatArray, longitude: FloatArray, altitude: F
     values: dict[str, AnyArray] = {"latitude_deg": latitude, "longitude_deg": longitude}
     lost = _pose.clean(rows, values)
     values["altitude_m"], rows.height_from = altitude, "program"
-    # Android's Location.getAltitude counts from the WGS 84 ellipsoid
+    # Android's Location.getAltitude is above the WGS 84 ellipsoid
     values["altitude_m"], about = _pose.above_takeoff(rows, values, "ellipsoid", lost)
     return rows.stream("telemetry", "phone", values, where=~lost, source="PawPrints location", about=about)
 
@@ -140,7 +140,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         _reading(i, cell, _json.number(entry.get("connected_pci")))
         for i, entry in enumerate(timed) for cell in _json.listed(entry, "cells")
     ]  # fmt: skip
-    # positions are in the objects or in their 'location'
+    # positions are in the objects themselves or in 'location'
     places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in timed]
     names = (("latitude", "lat"), ("longitude", "lon", "lng"), ("altitude", "alt"))
     track = _placed(rows, *(_json.column(places, *keys) for keys in names))

@@ -1,11 +1,11 @@
 """PX4 log (``.ulg``): position, attitude, velocity and GPS of the aircraft's own log.
 
-The format describes itself: ``F`` messages contain the fields of each topic, ``A`` its number, ``D`` its data. The
-topics ``vehicle_global_position``, ``vehicle_attitude`` (quaternion) and ``vehicle_local_position`` (velocity) are
-read, and ``vehicle_gps_position`` or ``sensor_gps`` for UTC and fix, or for the position if there is no other. Instance
-0 of each topic is read. If there are several receivers, the receiver with the most fixes is read. Heights are above
-``home_position`` at take-off, else above the ground at rest or the first position. Source: PX4 guide, "ULog File
-Format".
+The format describes itself: ``F`` messages contain the fields of each topic, ``A`` messages its number, and ``D``
+messages its data. The topics ``vehicle_global_position``, ``vehicle_attitude`` (quaternion) and
+``vehicle_local_position`` (velocity) are read, and ``vehicle_gps_position`` or ``sensor_gps`` for UTC and fix, and for
+the position if there is no other source. Instance 0 of each topic is read. If there are several receivers, the receiver
+with the most fixes is read. Heights are above ``home_position`` at take-off, else above the ground at rest or the first
+position. Source: PX4 guide, "ULog File Format".
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
 def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
-    """Return the layout of a topic, or None if it contains another topic (no topic that is read does)."""
+    """Return the layout of a topic, or None if it contains another topic. None of the topics that are read does."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for part in text.split(";"):
         if not part:
@@ -83,7 +83,7 @@ def _topics(data: bytes) -> tuple[dict[str, _Topic], int, list[RejectedLine]]:
     for (name, _), messages in sorted(bodies.items()):
         numbers, content = zip(*messages, strict=True)
         table = _table(content, forms.get(name, ""))
-        # the first receiver with the most fixes
+        # use the receiver with the most fixes
         if name not in topics or _fixes(table) > _fixes(topics[name][1]):
             topics[name] = [*numbers], table
     return {name: topics.get(name, ([], _table((), ""))) for name in _WANTED}, count, damaged

@@ -1,8 +1,8 @@
 """Console of AERPAW's Quectel logger: tables drawn with ``+----+`` and ``|``, each after a line with its time.
 
 Rows ``| 0 | +QENG: "LTE" | ... |`` contain the LTE cell, ``NR5G-NSA`` (RSRP, SINR, RSRQ) and ``NR5G-SA`` (RSRP, RSRQ,
-SINR) the NR cell, and ``+QNWCFG: "nr5g_csi"`` the rank (from one; 0 means no CSI). Times are local, and the time of a
-row is that of its table.
+SINR) the NR cell, and ``+QNWCFG: "nr5g_csi"`` the rank (from one; 0 means no CSI). Times are local, and all rows of a
+table have the same time.
 """
 
 from __future__ import annotations

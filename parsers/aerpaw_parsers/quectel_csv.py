@@ -1,10 +1,10 @@
 """CSVs of AERPAW's Quectel logger (``csv_kpi``): rank indicator and serving-cell level, from both generations.
 
 A console of the modem (EC25, RM500Q to RM520N) with time stamps contains the same answers, with each radio access on a
-separate line. The stamp is in front of the answer or on a line above it, as ``date``, Python's logging or an epoch
-writes it.
+separate line. The time stamp is in front of the answer or on a line above it, in the form of ``date``, of Python's
+logging, or of an epoch.
 
-There is no header, and a first line may be a bare ``OK``. Fields are raw pieces of AT answers with their
+There is no header, and the first line may be ``OK``. Fields are raw pieces of AT answers with their
 ``+QNWCFG: "nr5g_csi"`` prefix. Rows are distinguished by their RAT token and not by the file name, because the logger
 writes NR5G-SA answers to ``..._LTE_only.csv``.
 
@@ -38,7 +38,7 @@ from aerpaw_cmp.logs.rows import Rows, built, checked_ranks
 from aerpaw_cmp.readers import TIME, ZONE, Attribute, OtherLines, Reader, ReadOptions, ReadResult, Stream
 
 _C = rb"[^,\n]{0,80}"
-# The logger's CSV, or a console whose lines have a stamp (ts, a terminal program).
+# Beginning of a line: the logger's CSV, or a console with time stamps (ts, a terminal program).
 _T = rb"^\[?(?P<time>" + TIME + ZONE + rb")(?:,|\]?[ \t]{1,4})"
 
 
@@ -59,13 +59,14 @@ _LTE = _SERVING + _answer(b"QENG", b"LTE", b"lte", ". . . . pci arfcn . . . . rs
 _SA = _SERVING + _answer(b"QENG", b"NR5G-SA", b"nr", ". . . . pci . arfcn . . rsrp rsrq sinr")
 _NSA = _answer(b"QENG", b"NR5G-NSA", b"nr", ". . pci rsrp sinr rsrq")
 _ARFCN = _fields(b"nr", "arfcn")
-# A fifth value of newer firmware; the four columns of +QNWINFO, which the first generation writes around the CSI.
+# A fifth value, which newer firmware writes, and the four columns of +QNWINFO, which the first generation writes around
+# the CSI.
 _FIFTH, _INFO = rb"(?:,-?\d{1,7})?", (_C + rb",") * 4
-# Kinds of row: those of the logger, then those of a console, with each radio access on a separate line.
+# Kinds of row: first rows of the logger, then rows of a console, which has each radio access on a separate line.
 _FORMS = tuple(
     re.compile(_T + form + rb"[ \t]*\r?$", re.MULTILINE) for form in (
         rb"(?:" + _INFO + rb")?" + _CSI[b"lte"] + b"," + _CSI[b"nr5g"] + _FIFTH + rb"(?:(?:," + _C + rb"){4})?",
-        # firmware versions differ after the SINR
+        # the fields after the SINR differ between firmware versions
         _LTE + rb"(?:," + _C + rb"){1,3}(?:," + _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){3})?)?",
         _SA + rb"(?:," + _C + rb"){0,3}",
         _NSA + rb"(?:" + _ARFCN + rb"(?:," + _C + rb"){1,4})?",
@@ -132,7 +133,7 @@ def _reason(line: bytes) -> str | None:
 
 def _table(lines: _text.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     """Return the lines of all kinds of row, and their columns of text, with an index into ``_FORMS`` as ``form``."""
-    # a log of CSI has no other kinds of row, and the search for them is slow
+    # skip the search for other kinds of row in a log of CSI, because it is slow
     serving = b"servingcell" in lines.data or lines.data.startswith(b"[")
     tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
     for i, pattern in enumerate(_FORMS if serving else _FORMS[:1]):
@@ -182,7 +183,7 @@ def _levels(rows: Rows, rat: str, where: BoolArray) -> Iterator[Stream | None]:
         _text.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
         values["sinr_db"] = np.where(fits, sinr, np.nan)
     named = where & (pci >= 0) & (pci <= _MOST_PCI)
-    # infinity sorts after every carrier and means a missing carrier
+    # represent a missing carrier by infinity, which sorts after every carrier
     carrier = np.where(arfcn > 0, arfcn, np.inf)
     cells = sorted(set(zip(pci[named].tolist(), carrier[named].tolist(), strict=True)))
     common: dict[str, Attribute | None] = {"unit": rows.options.unit or "dBm", "quantity": "RSRP", "rat": rat}

@@ -1,7 +1,7 @@
 """Position solutions of RTKLIB (``.pos``): latitude, longitude and height.
 
 A comment line (``%``) names the columns. Its first name is the time scale: GPST, UTC or JST. Times are a date with a
-clock, or a GPS week with its second. The fix is that of MAVLink: 3 single, 4 differential, 5 and 6 RTK, 8 PPP.
+clock, or a GPS week with its second. The fix has MAVLink's numbers: 3 single, 4 differential, 5 and 6 RTK, 8 PPP.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             cause="another out-solformat: solve again with 'llh' and out-degform 'deg'",
         )  # fmt: skip
     scale = header[1].decode() if header is not None else "UTC"
-    above_sea = header is not None and b"geodetic" in data[: header.start()]  # the default is the ellipsoid
+    above_sea = header is not None and b"geodetic" in data[: header.start()]  # else above the ellipsoid
     names = ("latitude", "longitude", "altitude msl" if above_sea else "height hae", "fix", "satellites")
     for i in np.flatnonzero(~lines.blank).tolist():
         found = _ROW.fullmatch(lines.text(i))

@@ -2,8 +2,8 @@
 
 Dataset 12 (``captures[]``) has ``measurement:values`` {mX, mY, mZ, RSS1, RSS2} with ``measurement:time_stamp``, and
 ``gps:position`` {x, y, z} with ``gps:time_stamp``. x is the longitude, y the latitude, z the height above take-off, and
-RSS is in dB re full scale. A value is a list (a flight) or a number (a burst). A global field of the same name is used
-for captures without it. A sounder has ``core:timestamp`` (epoch), ``core:rx_location``, ``core:rotation``,
+RSS is in dB re full scale. A value is a list (a flight) or a number (a burst). A capture without a field uses the
+global field of the same name. A sounder has ``core:timestamp`` (epoch), ``core:rx_location``, ``core:rotation``,
 ``core:velocity`` and ``core:frequency``; SigMF 1.x has ``core:geolocation`` per capture, above the ellipsoid.
 
 Each frequency has a series. Header bytes (``core:header_bytes``) are not samples, and unsigned samples count from the
@@ -29,7 +29,8 @@ from . import _json, _pose, _stamps
 _BURST_S = 0.02
 # Part of full scale at which a value is clipped, and the share of such values that is reported.
 _FULL, _CLIPPED_SHARE = 0.999, 1e-3
-# A DC part this far above the rest determines the level [dB]; a weaker one may be the signal's own carrier.
+# A DC part this far above the rest of the power determines the level [dB]. A weaker DC part may be the carrier of the
+# signal.
 _DC_DB = 10.0
 # Complex or real, float or integer, and the bits of a number.
 _DATATYPE = re.compile(r"([cr])(f(?=32|64)|[iu](?=8|16|32))(8|16|32|64)(?:_[lb]e)?")
@@ -56,14 +57,14 @@ def _merged(meta: dict[str, Any]) -> list[dict[str, Any]]:
     common = {key: value for key, value in _json.inside(meta, "global").items() if ":" in key}
     captures = _json.listed(meta, "captures")
     for capture in captures:
-        # a global position for all captures is that of a receiver on the ground, not a track
+        # a global position is the position of a receiver on the ground, not a track
         point = [*_list(_json.inside(capture, "core:geolocation").get("coordinates")), None, None]
         capture |= {"geolocation": dict(zip("xyz", point, strict=False))} if point[0] is not None else {}
     return [{**common, **capture} for capture in captures] or [common]
 
 
 def _column(captures: list[dict[str, Any]], field: str, *names: str) -> FloatArray:
-    """Return a quantity of all captures, one after the other."""
+    """Return a quantity of all captures as one array."""
     out: list[float] = []
     for capture in captures:
         place = _json.inside(capture, field)
@@ -190,7 +191,7 @@ def _powers(
     if samples is None or not rate > 0:
         return
     size, zero = max(1, round(_BURST_S * rate)), _integer(common.get("core:offset"))
-    # 0 lies between the two middle codes: 127.5 of 0 .. 255
+    # zero is between the two middle codes, such as 127.5 for codes 0 to 255
     middle = full_scale - 0.5 if samples.dtype.kind == "u" else 0.0
     # stamp of the capture, seconds after it, frequency, and per channel power, mean and share of clipped values
     bursts: list[tuple[str, float, float, FloatArray, FloatArray, FloatArray]] = []
@@ -200,12 +201,12 @@ def _powers(
         if stamp is None:
             warnings.append("captures without core:datetime have no time and are not read")
             continue
-        # less than half a burst at the end of a capture is not read
+        # the end of a capture is not read if it is shorter than half a burst
         for at in range(start, end - size // 2, size):
             piece = samples[at : min(at + size, end)].astype(np.float64) - middle
             with np.errstate(all="ignore"):  # damaged samples may be any number
                 power, size_of = (piece**2).sum(axis=2).mean(axis=0), np.abs(piece)
-                # floats far above full scale have an unknown scale
+                # floats far above full scale are not clipped, but have an unknown scale
                 clipped = (size_of >= _FULL * full_scale - 1.0 * (full_scale > 1)) & (size_of <= 1.001 * full_scale)
                 about = power, piece.mean(axis=0), clipped.mean(axis=(0, 2))
             bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency")), *about))

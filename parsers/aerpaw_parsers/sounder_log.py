@@ -1,10 +1,10 @@
 """GNU Radio channel sounder logs (``power_log``, ``quality_log``, ``snr_log``): ``od -f -w4`` through ``ts``.
 
-``[2025-01-01 12:00:00.000000] 0000014      -35.401386``: arrival time, **octal** byte offset of the sample
-(four bytes each), value in dB re full scale. ``*`` stands for samples equal to the one before. The last line
-may contain only an offset. With no signal the power is 20 log10(FLT_MIN) minus the gain, about -790 dB.
-Writer: AERPAW ``startGNURadio-ChannelSounder-RX.sh``. Its nightly soundings between towers name the link in the file's
-name: ``LW1:LW2:3235751:3.32G:0:2026-06-01_02_00_05:power_log.txt`` (transmitter or ``null``, receiver, radio, channel).
+``[2025-01-01 12:00:00.000000] 0000014      -35.401386``: arrival time, **octal** byte offset of the sample (four bytes
+each), value in dB re full scale. ``*`` replaces samples that are equal to the sample before them. The last line may
+contain only an offset. Without a signal, the power is 20 log10(FLT_MIN) minus the gain, about -790 dB. Writer: AERPAW
+``startGNURadio-ChannelSounder-RX.sh``. Its nightly soundings between towers name the link in the file's name:
+``LW1:LW2:3235751:3.32G:0:2026-06-01_02_00_05:power_log.txt`` (transmitter or ``null``, receiver, radio, channel).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from . import _identity
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
 _WIDTHS = range(7, 13)  # octal digits of the offset; seven until 2 MiB of samples, ten from 128 MiB on
-_MOST_REPEATS = 5_000_000  # two days at 30 samples per second: a damaged offset implies more
+_MOST_REPEATS = 5_000_000  # two days at 30 samples per second; only a damaged offset implies more
 _HEAD = rb"^\[(" + _text.TIME + rb")\] "
 # A sample, a '*' (no offset) or a last line (no value).
 _LINE = re.compile(_HEAD + rb"+(?:\*|([0-7]{7,12})(?: +(" + _text.NUMBER + rb"|-?nan|-?inf))?)[ \t]*$")
@@ -78,14 +78,14 @@ def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
     texts = np.ascontiguousarray(cells).view(f"S{_VALUE}").ravel()
     plain = np.ones(len(texts), dtype=bool)
     digit, point = cells >= 48, cells == 46
-    # NumPy also accepts a number that begins or ends with a point, and spaces behind it
+    # exclude numbers that begin or end with a point, and trailing spaces, because NumPy accepts them
     complete = digit[:, -1].all() and not point[:, 0].any() and digit[:, :-1][point[:, 1:]].all()
     try:
         if complete and _OF_DECIMALS[cells].all():
             return texts.astype(np.float64), plain
     except ValueError:
         pass
-    # a damaged line, which is rare: test each text
+    # there is a damaged line, which is rare, so test each text
     plain[:] = [_DECIMAL.fullmatch(text) is not None for text in texts.tolist()]
     return np.where(plain, texts, b"0").astype(np.float64), plain
 
@@ -128,7 +128,7 @@ class _Piece:
 
 
 def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
-    """Read samples of od's layout at once, and the few other lines one by one."""
+    """Read all samples in the layout of od at once, and the few other lines one by one."""
     fixed, wrong = _fixed_layout(lines)
     rejects.add(lines, wrong, "the offset is not an octal number: not written by od")
     unread = ~lines.blank
@@ -178,7 +178,7 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     feet = marks.take(marks.offset >= 0)
     if not len(stars.line):
         return _Samples.none(), stars.line, []
-    # a last line that contains only an offset ends the last run, like a sample without a value
+    # if the last line contains only an offset, it ends the last run like a sample without a value
     near = np.unique(np.searchsorted(samples.line, stars.line).clip(max=len(samples.line) - 1))
     ends = (samples.take(near) if len(samples.line) else samples).join(feet)
     after = np.searchsorted(ends.line, stars.line)
@@ -213,9 +213,9 @@ _NAMED = re.compile(r"(?<![a-z])(power|quality|snr)(?![a-z])|(?:power|quality|sn
 
 
 def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
-    """Return one stream of levels. ``options.channel`` or the file name decides its kind: all logs have one layout.
+    """Return one stream of levels. ``options.channel`` or the file name decides its kind; all layouts are equal.
 
-    The samples of all pieces are stored; runs, times and flags are computed for all of them.
+    Runs, times and flags are computed from the samples of all pieces together.
 
     Raises
     ------
@@ -266,7 +266,7 @@ def _stream(log: _Piece, repeats: _Samples, options: ReadOptions, warnings: list
         repeated = np.isin(samples.line, repeats.line)  # lines of '*' contain no other samples
         restored = counted(len(repeats.line), "sample was", "samples were")
         warnings.append(f"{restored} restored, flagged 'repeated': the program od writes '*' for values that repeat")
-    # a log may have 1 GB: free each column as soon as it is not needed
+    # free each column when it is not needed any more, because a log may have 1 GB
     jump = samples.offset
     jump[1:] -= jump[:-1]
     jump[0] = 0

@@ -1,7 +1,7 @@
 """srsENB console (through ``ts``): the ``ri`` column of the downlink trace.
 
 ``[time] lte [pci] rnti cqi ri mcs brate ok nok (%) | ...`` once a second; newer versions print the cell's ``pci``.
-srsLTE before 2020 printed neither ``rat`` nor the bar. All other lines count as comments.
+srsLTE before 2020 printed neither ``lte`` nor the bar. All other lines count as comments.
 
 Meaning of ``ri`` in srsRAN 4G (metrics of the MAC, ``metrics_stdout.cc``): the MAC adds one to each reported RI and
 averages over the metrics period, and the trace prints ``int(dl_ri)``. **0 means that there was no report**, 1 is rank

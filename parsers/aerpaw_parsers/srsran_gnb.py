@@ -69,7 +69,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 def sniff_json(head: bytes) -> bool:
     """Check whether the first object has a list of UEs with RI."""
     first = _json.first(head)
-    if first is None:  # the first line is longer than the bytes that sniffers see
+    if first is None:  # the first line is longer than the sniffed bytes
         return head.lstrip()[:1] == b"{" and b'"ue_list"' in head and re.search(rb'"(dl_)?ri"\s*:', head) is not None
     return "timestamp" in first and (any(True for _ in _ues(first)) or b'"ue_list"' in head)
 

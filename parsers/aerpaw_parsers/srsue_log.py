@@ -1,8 +1,9 @@
 """srsUE console (through ``ts``): RSRP, path loss, CFO and SNR of each carrier, once a second.
 
 ``[time] cc pci rsrp pl cfo | mcs snr iter brate bler ta_us | mcs buff brate bler``, before 2020 without ``pci`` and
-bars. RSRP is in dBm of an uncalibrated front end (the level follows the gain), path loss in dB as the UE computes it,
-CFO in Hz with SI suffix. It does not print ranks. There is a level stream per cell, and the carrier offset as KPI.
+bars. RSRP is in dBm of an uncalibrated front end, so it depends on the gain. Path loss is in dB as the UE computes it,
+CFO in Hz with an SI suffix. The console does not print ranks. There is a level stream per cell, and the carrier offset
+as KPI.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from . import _cells
 _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
     rb"^\[(?P<time>" + TIME + ZONE + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
-    # a PCI only if three more numbers come before the bar: srsLTE before 2020 printed no PCI
+    # there is a PCI only if three more numbers come before the bar, because srsLTE before 2020 printed none
     + rb"(?:" + _N % b"pci" + rb"(?=(?: +\S+){3} \|))?" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"
     + rb"(?: \|)?" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}(?:\|[^\n]{0,80})?$", re.MULTILINE,
 )  # fmt: skip

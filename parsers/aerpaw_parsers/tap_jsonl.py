@@ -9,12 +9,12 @@ integers [ns]: UTC since 1970 and the monotonic clock.
 ``late unsolicited noise``  answers without a command
 ``gap``         ``state`` ``open`` at the loss, ``closed`` at the return, with ``from_utc_ns to_utc_ns missed``
 ``clock disk alarm prediction``  other events
-``rotate end``  last line of a segment, and of the last one
+``rotate end``  last line of a segment, and of the last segment
 
-An exchange is accepted as a record of rank (``nr5g_csi``, ``lte_csi``) or of RSS, or as a companion of these. RSS is
+An accepted exchange is a record of rank (``nr5g_csi``, ``lte_csi``) or of RSS, or adds values to such a record. RSS is
 the RSRP of ``servingcell`` for NR and LTE, with a series per cell (PCI, ARFCN). All other intact lines are comments.
-The time of a record is the middle between command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR
-of a rank are those of the last ``servingcell`` within 2 s.
+The time of a record is midway between command and last byte, and ``uncertainty_s`` is half the time between them. RSRP
+and SINR of a rank come from the last ``servingcell`` within 2 s.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def _records(lines: Lines) -> tuple[list[_Record], list[RejectedLine]]:
         except ValueError as error:
             rejected.append(lines.reject(i, f"torn tail: {error}" if i == torn else str(error)))
             continue
-        if i == torn:  # complete by its checksum, but flagged as in other readers
+        if i == torn:  # complete according to its checksum, but flagged as in other readers
             record["flags"] = [*_flags(record), "unterminated_line"]
         records.append((i + 1, record))
     return records, rejected
@@ -183,10 +183,10 @@ def _frame(exchanges: list[_Record], query: str, leg: str, names: Mapping[str, s
 
 
 def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:
-    """Yield the levels of each serving cell, whose identity is in the name if there are several."""
+    """Yield the levels of each serving cell. Names contain the identity of the cell if there are several cells."""
     cells = rsrp.groupby(["pci", "arfcn"], dropna=False, sort=False)
     for _, of_cell in cells:
-        # an answer that lost a line has no band, but belongs to the same cell
+        # an answer with a lost line has no band, but belongs to the same cell
         identity = of_cell[list(_IDENTITY)].max()
         about = {key: int(identity[key]) for key in _IDENTITY if np.isfinite(identity[key])}
         words = [f"{key}{about[key]}" for key in ("pci", "arfcn") if key in about] if cells.ngroups > 1 else []

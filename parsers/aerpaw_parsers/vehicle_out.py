@@ -1,4 +1,4 @@
-"""``vehicleOut``: the autopilot's telemetry, one line a second, in all its generations.
+"""``vehicleOut``: the autopilot's telemetry, one line a second, in all generations of its format.
 
 ====== =================================================================================================
 fields layout
@@ -52,7 +52,7 @@ _FIELDS = _SEP.join(
 _END = rb"[ ,\t]{0,8}\r?$"
 _MORE = rb"(?:,[^,\n]{0,80})"
 _ROW = re.compile(_FIELDS + _END, re.MULTILINE)
-# A logger may write further fields; most first rows must have them, because joined rows also look like this.
+# A logger may write further fields. Most of the first rows must have them, because two joined rows also look like this.
 _LONGER = re.compile(_FIELDS + _MORE + rb"{1,6}" + _END, re.MULTILINE)
 _EITHER = re.compile(_FIELDS + _MORE + rb"{0,6}" + _END, re.MULTILINE)
 _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while there is no fix
@@ -70,7 +70,7 @@ _TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|ind
 
 def _reason(line: bytes) -> str | None:
     if _TITLE.match(line):
-        return None  # the title line of converted logs
+        return None  # title line of converted logs
     fields = len(re.sub(rb"\([^()]*\)", b"", line).split(b","))
     if fields not in (8, 9, 10, 11):
         return f"{fields} fields where 8, 9, 10 or 11 were expected (truncated line?)"
@@ -111,7 +111,7 @@ def _values(rows: Rows, number: dict[str, FloatArray]) -> dict[str, AnyArray]:
     if zero.any():
         rows_of = counted(int(zero.sum()), "row has", "rows have")
         text = f"{rows_of} attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
-        if zero.all():  # not a real attitude: level and due north in every row
+        if zero.all():  # level and due north in every row is not a real attitude
             text += " zero_attitude and read as unknown, because no row has another attitude"
             motion = {name: np.full(len(rows), np.nan) for name in motion}
         rows.warnings.append(text)

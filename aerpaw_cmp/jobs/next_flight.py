@@ -54,6 +54,9 @@ _MOST_TARGETS = 600
 # Number of headings at target points without a heading.
 HEADINGS = 4
 
+# Smallest distance of a route from the walls and the roof of a building [m].
+_CLEARANCE_M = 3.0
+
 # Largest number of corners of an area. Geofences are drawn by hand and have far fewer.
 _MOST_CORNERS = 10_000
 # A target is refused if all of it is farther than this outside the geofence, and so is a geofence outside the site [m].
@@ -196,16 +199,26 @@ def _plan_flight(
 
 def _candidates(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """Return the tool's patterns and the routes of files. UsageError if none of them may be flown."""
-    candidates = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
+    flyable = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
+    candidates = [replace(c, refused=c.refused or _blocked(c.route.position_m, site)) for c in flyable]
     if all(candidate.refused for candidate in candidates):
-        first = (
-            f"{candidates[0].route.name} {candidates[0].refused}" if candidates else "no pattern lies in the geofence"
-        )
+        first = f"{candidates[0].route.name} {candidates[0].refused}" if candidates else "no pattern is in the geofence"
         raise UsageError(
             f"no route fits: {first}",
-            expected="a route within geofence, battery and distance to towers: a larger area, or --route FILE",
+            expected="a route within geofence, battery, distances: another area or --height, or --route FILE",
         )
     return candidates
+
+
+def _blocked(position_m: FloatArray, site: Site) -> str:
+    """Return the reason for a refusal if a track (n, 3) is too near to a building, otherwise an empty text."""
+    legs = np.stack([position_m[:-1], position_m[1:]], axis=1)
+    lines, lowest_m = shapely.linestrings(legs[..., :2]), legs[..., 2].min(axis=1)
+    for building in site.buildings:
+        low = lowest_m < building.base_m + building.height_m + _CLEARANCE_M
+        if low.any() and shapely.dwithin(lines[low], building.footprint, _CLEARANCE_M).any():
+            return f"passes less than {_CLEARANCE_M:g} m from building '{building.name}' ({building.height_m:g} m high)"
+    return ""
 
 
 def _sentence(best: Candidate, curve: Sequence[Mapping[str, float]], now_db: float) -> str:

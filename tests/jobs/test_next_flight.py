@@ -1,6 +1,7 @@
 """The plan command on the packaged site: files, bad input, and headings where antennas are unknown."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,14 +113,22 @@ def test_bad_input_is_one_message(
 
 def test_points_without_a_position_are_left_out_and_counted(place: Path) -> None:
     out = place / "points_out"
-    assert (
-        main(["plan", str(place / "points.csv"), *SITE, "--geofence", str(place / "fence.kml"), "-o", str(out), "-q"])
-        == 0
-    )
+    words = [str(place / "points.csv"), *SITE, "--geofence", str(place / "fence.kml"), "-o", str(out), "-q"]
+    assert main(["plan", *words]) == 0
     table = pd.read_csv(out / "sd_map.csv")
     assert len(table) == 2 * 4  # four headings at each of two points
     assert table.notna().all().all()
     assert "1 of 3 points without a position" in " ".join(json.loads((out / "metrics.json").read_text())["warnings"])
+
+
+@pytest.mark.parametrize(("away_m", "above_m", "refused"), [(0, 2, True), (0, 4, False), (2, -5, True), (4, -5, False)])
+def test_a_track_through_or_near_a_building_is_refused(away_m: float, above_m: float, refused: bool) -> None:
+    site = load_site("lake_wheeler")
+    barn = site.buildings[0]
+    west, _, east, north = barn.footprint.bounds
+    up = barn.base_m + barn.height_m + above_m
+    track = np.array([[west - 500, north + away_m, up], [east + 500, north + away_m, up]])
+    assert bool(next_flight._blocked(track, replace(site, buildings=(barn,)))) == refused
 
 
 def test_without_a_geofence_the_area_is_that_of_the_site() -> None:

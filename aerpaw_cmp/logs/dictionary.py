@@ -74,10 +74,7 @@ _HEIGHT = r"(alt|altitude|height|hgt|elevation|ele)"
 def table(path: Path) -> Mapping[str, Any]:
     """Return a table that is part of this package, with every value as text."""
     # the C loader, which all wheels of PyYAML contain, reads the dictionary in 10 ms
-    content: Mapping[str, Any] = yaml.load(
-        path.read_text(encoding="utf-8"), Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader)
-    )
-    return content
+    return dict(yaml.load(path.read_text(encoding="utf-8"), getattr(yaml, "CBaseLoader", yaml.BaseLoader)))
 
 
 _FILE = table(Path(__file__).with_name("dictionary.yaml"))
@@ -98,6 +95,10 @@ PATTERNS = {name: re.compile("".join(pieces)) for name, pieces in _FILE["pattern
 ZONES: Mapping[str, Mapping[str, Any]] = _FILE["zones"]
 HINTS: Mapping[str, Sequence[str]] = _FILE["hints"]
 FIXES: Mapping[str, str] = _FILE["fixes"]
+TEXTS: Mapping[str, Sequence[str]] = _FILE["texts"]
+IDLE: Mapping[str, Sequence[str]] = _FILE["idle"]
+DATES: Sequence[str] = _FILE["dates"]
+DAY_NUMBERS: Mapping[str, Sequence[str]] = _FILE["day_numbers"]
 LIMITS: Mapping[str, Mapping[str, Sequence[str]]] = _FILE["limits"]
 # Hours east of UTC, and a zone with summer time, of each meaning of an ambiguous abbreviation.
 WINTER = {
@@ -496,8 +497,8 @@ def has(kind: str, words: str) -> bool:
 
 
 def is_statistic(name: str) -> bool:
-    """Check whether a name contains a word for a mean, a maximum or a prediction."""
-    return any(has(kind, plain(name)) for kind in ("mean", "indirect"))
+    """Check whether a name contains a word for a mean, a maximum, a prediction or a raw level."""
+    return any(has(kind, plain(name)) for kind in ("mean", "indirect", "raw"))
 
 
 def can_be_level(name: str) -> bool:

@@ -73,11 +73,9 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
         Kind and name of the stream, for the sentence.
     """
     none = np.zeros(len(frame), dtype=np.bool_)
-    if not {"latitude_deg", "longitude_deg"} <= set(frame.columns):
+    if not {*PLACE[:2]} <= set(frame.columns) or len((path := path_of(frame))[0]) < 3:
         return none, ""
-    rows, time_s, place_m = path_of(frame)
-    if len(rows) < 3:
-        return none, ""
+    rows, time_s, place_m = path
     speed_mps = typical_speed_mps(time_s, place_m)
     if speed_mps > FASTEST_MPS and not _comes_back(time_s, place_m):
         slower = {unit: speed_mps / factor for unit, factor in _OTHER_UNITS.items()}
@@ -171,7 +169,10 @@ def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
-    """Return the rows (n,) whose position does not change despite a logged speed, and a sentence about them.
+    """Return the rows (n,) whose position does not change although the aircraft moves, and a sentence about them.
+
+    The logged speed shows that the aircraft moves. Without a speed, the position must catch up in one step that is too
+    fast for the track, but not for the time since the position changed last.
 
     Parameters
     ----------
@@ -181,16 +182,19 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
         Kind and name of the stream, for the sentence.
     """
     none = np.zeros(len(frame), dtype=np.bool_)
-    if not {*PLACE[:2], *_SPEEDS} <= set(frame.columns):
+    if not {*PLACE[:2]} <= set(frame.columns) or len((path := path_of(frame))[0]) < 3:
         return none, ""
-    rows, time_s, place_m = path_of(frame)
-    speed = np.hypot(*(frame[name].to_numpy(np.float64)[rows] for name in _SPEEDS))
-    if len(rows) < 3 or not np.nan_to_num(speed).any():
-        return none, ""
-    travel_m = np.concatenate([[0.0], np.cumsum(np.nan_to_num(speed[1:]) * np.abs(np.diff(time_s)))])
+    rows, time_s, place_m = path
+    logged = [np.nan_to_num(frame[name].to_numpy(np.float64)[rows]) for name in _SPEEDS if name in frame.columns]
+    steps_m = np.hypot(*logged)[1:] * np.abs(np.diff(time_s)) if len(logged) == 2 else np.zeros(len(rows) - 1)
+    travel_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     begins = np.concatenate([[0], np.flatnonzero((np.diff(place_m[:, :2], axis=0) != 0).any(axis=1)) + 1])
     last = np.append(begins[1:], len(rows)) - 1
     lasts_s, moved_m = np.abs(time_s[last] - time_s[begins]), travel_m[last] - travel_m[begins]
+    if not steps_m.any():
+        leaps = np.isin(begins, _runs(time_s, place_m)[0])[1:]
+        step_m = np.linalg.norm(np.diff(place_m[begins, :2], axis=0), axis=1) * leaps
+        moved_m = np.append(np.where(step_m < FASTEST_MPS * lasts_s[:-1], step_m, 0.0), 0.0)
     runs = (lasts_s > _STALE_S) & (moved_m > _JITTER_M) & (moved_m > _STALE_MPS * lasts_s)
     if not runs.any():
         return none, ""
@@ -200,7 +204,7 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     line, speed_mps = int(frame["line"].iloc[rows[begins[longest]]]), moved_m[longest] / lasts_s[longest]
     return none, (
         f"{what}: {counted(int(none.sum()), 'row is', 'rows are')} flagged {STALE}: positions "
-        f"do not change for {lasts_s[longest]:.0f} s from line {line} on, at a logged speed of {speed_mps:.1f} m/s; "
+        f"do not change for {lasts_s[longest]:.0f} s from line {line} on, at a speed of {speed_mps:.1f} m/s; "
         "read as missing"
     )
 

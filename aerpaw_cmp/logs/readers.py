@@ -279,26 +279,29 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 
 
 def _way_out(head: bytes) -> str:
-    titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
-    lines = [decoded(line).strip() for line in titled.split(b"\n")[:20]]
-    # take the most frequent sign as the separator, because decimal commas are rarer, and titles have fewer separators
-    # than names
+    lines = [decoded(line).strip() for line in head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n")[:30]]
+    # take the most frequent sign as the separator, because decimal commas are rarer
     sign = max(",;\t|", key="".join(lines).count)
-    first, *below = lines[max(range(len(lines)), key=lambda i: lines[i].count(sign)) :]
-    names = [name.strip().strip('"') for name in first.split(sign)]
-    if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
+    rows = [line.strip("# ").split(sign if any(sign in line for line in lines) else None) for line in lines]
+    # a header has as many fields as the row below it, and only the row contains numbers; titles have fewer fields
+    valued = [any(map(_NUMBER.match, row)) for row in rows]
+    heads = [i for i in range(len(rows) - 1) if valued[i : i + 2] == [False, True] and len(rows[i]) == len(rows[i + 1])]
+    at = max(heads or range(len(rows)), key=lambda i: (len(rows[i]), lines[i][:1] != "#"))
+    first, names = lines[at], [name.strip().strip('"') for name in rows[at]]
+    table = (heads or sign in first) and not any(name[:1].isdigit() for name in names)
+    if table and len(names) > 1 and not first.startswith(("{", "[", "<", "$")):
         if len(head) == HEAD_BYTES and b"\n" not in head:
             return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or not a table"
         if "\ufffd" in first:
             return "text in another encoding than UTF-8: save the table as UTF-8"
-        return _way_to_map(names, [line.split(sign) for line in below])
+        return _way_to_map(names, rows[at + 1 :])
     words = re.split(r"[,;\s|]+", first)
     if len(words) > 1 and (re.fullmatch(r"[-+.\d]+", words[0] + words[-1]) or "time" in words):
         return "a table without names or commas: write a line such as 'time,rss_db' above it, commas between its cells"
     return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 
-_CLOCK = re.compile(r"\d{4}.*\d:\d\d")
+_NUMBER = re.compile(r'[ "]*[-+]?\d')
 _NEGATIVE = re.compile(r'[ "]*-\d{1,3}(\.\d*)?[ "]*')
 
 
@@ -314,16 +317,21 @@ def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
         if not known[i] and rows and all(_NEGATIVE.fullmatch(row[i]) for row in rows)
         and not dictionary.has("unlike_a_level", dictionary.plain(name))
     ]  # fmt: skip
-    times = [name for i, name in enumerate(names) if rows and all(_CLOCK.search(row[i]) for row in rows)]
+    in_dbm = {name: dictionary.without_unit(name)[1] == "dbm" for name in names}
+    means = [name for name in names if in_dbm[name] and dictionary.has("statistic_of_a_level", dictionary.plain(name))]
+    times = [name for i, name in enumerate(names) if rows and all(dictionary.has("dated", row[i]) for row in rows)]
     names = [name for name in names if not re.search(elsewhere, dictionary.plain(name))]
     fits = {
         what: [name for words in forms for name in names if re.search(words, dictionary.plain(name))]
         for what, forms in dictionary.HINTS.items()
-    } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)] or levels}
+    } | {"rss_db": [name for name in dictionary.like_levels(names) if dictionary.can_be_level(name)] or levels or means}
     fits["time"] = fits["time"] or times
-    fits["rss_db"].sort(key=lambda name: dictionary.without_unit(name)[1] != "dbm")
+    ranks = [name for name in names if dictionary.has("like_a_rank", dictionary.plain(name))]
+    fits["rss_db"].sort(key=lambda name: (dictionary.is_statistic(name), not in_dbm[name], "rx" not in name.lower()))
     if fits["time"] and {"roll_deg", "pitch_deg"} <= {what.quantity.name for what in known if what}:
         return "angles without positions: write them into the table of the positions, at the same times"
+    if ranks and fits["time"] and not fits["rss_db"]:
+        return f"a table of another kind: name its columns: --map {fits['time'][0]!r}=time --map {ranks[0]!r}=rank"
     if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in dictionary.HINTS)):
         lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
         return f"a table of another kind; no column looks like {lacking}"

@@ -292,9 +292,7 @@ def built(
     instants.flag(flag)
     if lines.unterminated and not others.closed:
         _text.add_flag(flag, rows == len(lines) - 1, _text.UNTERMINATED)
-    warnings = list(instants.warnings)
-    if relative and len(rows):
-        warnings.append(RELATIVE)
+    warnings = [*instants.warnings, *[RELATIVE] * bool(relative and len(rows))]
     at, time = np.flatnonzero(~comment), instants.time
     column = {name: cells for name, cells in column.items() if name != "time"}
     if not valid.all():

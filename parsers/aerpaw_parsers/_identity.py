@@ -287,7 +287,7 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     """Return the texts of a column, empty where a text is not a name. 0 can name a device, but not a network."""
     meaning = sheet.meanings[column]
     code = meaning is not None and meaning.quantity.name == "network" and sheet.plain[column].startswith(_CODES)
-    none = {*_sheet.NO_VALUE, *_NO_IDENTITY, *("0" if code else "")}
+    none = {*_sheet.NO_VALUE, *dictionary.TEXTS["no_identity"], *("0" if code else "")}
     written = sheet.texts(column)
     whole = {text: _FLOAT.sub(r"\1", text) for text in {*written}}
     texts = [whole[text] for text in written]
@@ -295,11 +295,24 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     plain = {text: re.sub(r"(?<=[^\W\d])[-_ ](?=\d)", "", text.casefold()) for text in {*texts}}
     carriers = {text: attributes_of({sheet.plain[column]: text}).get("frequency_hz") for text in plain}
     plain |= {text: f"{hz:.9g}" for text, hz in carriers.items() if isinstance(hz, float)}
-    spelling = {plain[text]: text for text in reversed(texts)}
+    plain |= (damaged := _damaged(Counter(texts), plain))
+    for text in damaged:
+        sheet.notes[column] = f"column {sheet.names[column]!r}: {text!r} is read as a damaged {plain[text]!r}"
+    spelling = {plain[text]: text for text in reversed(texts) if text not in damaged}
     named = {text: "" if text.lower() in none else spelling[plain[text]] for text in {*texts}}
     return [named[text] for text in texts]
 
 
+def _damaged(counts: Counter[str], plain: Mapping[str, str]) -> dict[str, str]:
+    """Return the names in one row that differ from one frequent name only in characters that names do not have."""
+    often = [text for text, count in counts.items() if count > _DAMAGE_ROWS]
+    rare = [text for text, count in counts.items() if count == 1 and _DAMAGE.search(text)]
+    like = {text: [*filter(re.compile(_DAMAGE.sub(".", text)).fullmatch, often)] for text in rare}
+    return {text: plain[others[0]] for text, others in like.items() if len(others) == 1}
+
+
+# A damaged character, and the number of rows of a frequent name.
+_DAMAGE, _DAMAGE_ROWS = re.compile(r"[^\w\- .:/]|[\x80-\xff]"), 9
 # Pandas writes integers of a column with missing values as floats.
 _FLOAT = re.compile(r"^(\d+)\.0+$")
 
@@ -354,7 +367,6 @@ def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:
 
 _THOUSANDS = re.compile(r"\d{1,2}(?:,\d{3})+(?:\.\d+)?")
 _SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
-_NO_IDENTITY = ("2147483647", "4294967295", "268435455", "65535", "-1", "9223372036854775807")
 
 
 def _label(name: str, value: str) -> str:

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from itertools import compress, islice
+from itertools import accumulate, compress, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -156,13 +156,6 @@ def _angle(text: str) -> tuple[float, str]:
     return -value if {*written.groups()} & {"S", "W"} or text.startswith("-") else value, ""
 
 
-# 'Longitude (W)', 'lon_deg_W'; columns of such letters: 'lat_dir', 'lonRef', 'E/W'.
-_HEMISPHERE = re.compile(r"[^A-Za-z]([NSEW])[\])]?\s*$")
-_OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", re.IGNORECASE)
-# The radio access of a cell as programs write it.
-_RAT = re.compile(r"(?i)(lte|nr|[2345]g|gsm|umts|wcdma|e-?utran?)([ _-]?(a|nr|nsa|sa|lte|fdd|tdd|e-?utran?))?")
-_ANY_RAT = re.compile(r"(?i)lte|nr|^\s*\d|gsm|umts|wcdma|hs[dpu]|edge|gprs|cdma|iot|neigh|serv|detect|^\s*$")
-_DATE = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}|\d\d([-/.])\d\d\3\d\d")
 # Names of cells and satellites in columns that usually contain a state or a count.
 _A_CELL = re.compile(r"(?i)(?!\s*([01](\.0)?|[ps]?cell ?\d*)\s*$).*\d")
 _NETWORK = dictionary.meaning("gateway")
@@ -242,22 +235,22 @@ class Sheet:
         known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
         rats = {i for i, what in enumerate(known) if what and what.quantity.name == "technology"}
         # a column such as 'radio' may contain names of receivers
-        unlike = {i for i in rats if not any(_ANY_RAT.search(row[i]) for row in self.cells[:200])}
+        unlike = {i for i in rats if not any(dictionary.has("any_rat", row[i]) for row in self.cells[:200])}
         known = [None if i in unlike else what for i, what in enumerate(known)]
         # 'serving cell' may be a cell and not a state, 'satellite' a satellite and not their number
         for i, form in ((i, _NAMES_IN.get(what.quantity.name)) for i, what in enumerate(known) if what):
             known[i] = _NETWORK if form and any(form.match(row[i]) for row in self.cells[:200]) else known[i]
         # names such as 'mode' and 'Giorno' do not prove that the cells are radio accesses and dates
         names = {what.quantity.name for what in known if what}
-        for name, form in (("technology", _RAT), ("date", _DATE)):
+        for name, form_of in (("technology", "a_rat"), ("date", "a_date")):
             of_form = None if name in names else dictionary.meaning(name)
-            known = [of_form if what is None and self._all_are(form, i) else what for i, what in enumerate(known)]
+            known = [of_form if what is None and self._all_are(form_of, i) else what for i, what in enumerate(known)]
         return dictionary.with_places(zip(self.plain, known, strict=True))
 
-    def _all_are(self, form: re.Pattern[str], column: int) -> bool:
+    def _all_are(self, form: str, column: int) -> bool:
         """Check whether the first cells of a column have a form, except empty cells."""
         cells = {cells[column] for cells in self.cells[:200]} - {""}
-        return bool(cells) and all(map(form.fullmatch, cells))
+        return bool(cells) and all(map(dictionary.PATTERNS[form].fullmatch, cells))
 
     def find(self, *quantities: str) -> int | None:
         """Return the column that fits one of the quantities best, or an empty column if there is no other.
@@ -414,13 +407,13 @@ class Sheet:
             self.notes[column] = f"column {self.names[column]!r}: longitudes of 0 .. 360 deg: read as -180 .. 180"
             values = np.where(values > 180, values - 360.0, values)
         positive, negative = "NS" if quantity.name == "latitude_deg" else "EW"
-        own = _HEMISPHERE.search(self.names[column])
+        own = dictionary.PATTERNS["hemisphere"].search(self.names[column])
         if own is not None and own[1] in (positive, negative):
             # some programs write both the letter and the sign
             return -np.abs(values) if own[1] == negative else values
         for i, name in enumerate(self.names):
             letters = {cells[i].upper() for cells in self.cells[:50]} - {""}
-            if letters and letters <= {positive, negative} and (i == column + 1 or _OF_SIDES.search(name)):
+            if letters and letters <= {positive, negative} and (i == column + 1 or dictionary.has("of_sides", name)):
                 self.used.add(i)
                 west = np.array([text.upper() == negative for text in self.texts(i)])
                 return np.where(west, -np.abs(values), values)
@@ -450,14 +443,12 @@ class Sheet:
         if left:
             said.append(f"not read, though they look like levels, identities, positions, times or flags: {shown}{more}")
         words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
-        if words:
-            shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
-            text = "If one names the cell or device of a row, call it 'cell' or 'device' (or --map NAME=cell)"
-            said.append(f"not read: {shown}. {text}")
+        shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
+        text = "If one names the cell or device of a row, call it 'cell' or 'device' (or --map NAME=cell)"
+        said += [f"not read: {shown}. {text}"] * bool(words)
         gains = [i for i in left if dictionary.has("gain", self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
-        if gains:
-            text = "changes, and levels are not corrected for it: do they already include it?"
-            said.append(f"column {self.names[gains[0]]!r} {text}")
+        text = "changes, and levels are not corrected for it: do they already include it?"
+        said += [f"column {self.names[i]!r} {text}" for i in gains[:1]]
         # use only comments near the table, because a long log may have many comments between its rows
         near = (i for i in self.blank_rows.tolist() if len(self) and (i < TITLES or 0 < i - self.row[-1] <= TITLES))
         beside = {i + 1: self.lines.text(i).strip('#%;" ') for i in near}
@@ -467,9 +458,8 @@ class Sheet:
             if dictionary.has("of_values", text) and not text.startswith(self.names[0] or "?")
         ]
         equal = len(self) - len({*map(tuple, self.cells)})
-        if equal > _MOST_EQUAL * len(self):
-            said.append(f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?")
-        return said
+        text = f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?"
+        return said + [text] * (equal > _MOST_EQUAL * len(self))
 
     def _is_of_interest(self, column: int) -> bool:
         """Check whether a column has values and looks like a level, an identity, a position or a time."""
@@ -491,7 +481,7 @@ class Sheet:
         """Check whether a column with an unknown name has a few texts or numbers that may name cells or devices."""
         if self.meanings[column] is not None or dictionary.has("no_identity", self.plain[column]):
             return False
-        texts = {text.lower() for text in self.texts(column)} - {*NO_VALUE, *_YES_OR_NO}
+        texts = {text.lower() for text in self.texts(column)} - {*NO_VALUE, *dictionary.TEXTS["yes_or_no"]}
         if not 1 < len(texts) <= _MOST_SOURCES:
             return False
         if not all(text.isdecimal() for text in texts):
@@ -509,7 +499,6 @@ class Sheet:
 _OF_INTEREST = ("time", "position", "height", "identity", "cell", "rss", "rank", "kpi")
 # Largest share of rows that are equal to another row. Rows of the same second may be equal.
 _MOST_EQUAL = 0.3
-_YES_OR_NO = ("true", "false", "yes", "no", "on", "off", "y", "n", "ok")
 # Names contain a letter. A column with more different texts or numbers than this does not name cells or devices.
 _LETTER, _MOST_SOURCES, _MOST_NUMBERS = re.compile(r"[^\W\d_]"), 50, 8
 # Largest number of column names in one sentence.
@@ -517,10 +506,9 @@ _MOST_NAMED = 20
 _DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d{1,20},\d{1,40}")
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,40})?")
-# Text of cells without a value.
-NO_VALUE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "-infinity", "unavailable",
-            "unknown", "invalid"}  # fmt: skip
-_NO_ZONE = {*NO_VALUE, "local", "local time"}
+# Texts of cells without a value, and without a zone.
+NO_VALUE = {*dictionary.TEXTS["no_value"]}
+_NO_ZONE = {*NO_VALUE, *dictionary.TEXTS["no_zone"]}
 
 
 def read(data: bytes, is_header: _IsHeader) -> Sheet:
@@ -551,7 +539,7 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet:
 
 
 _DATE_PARTS = (("year", "yyyy", "yr"), ("month", "mon"), ("day", "doy", "day of year"))
-_CLOCK_PARTS = (("hour", "hours", "hr"), ("minute", "minutes", "min"), ("second", "seconds", "sec"))
+_CLOCK_PARTS = (("hour", "hours", "hr", "hour utc"), ("minute", "minutes", "min"), ("second", "seconds", "sec"))
 
 
 def has_date_in_parts(names: Iterable[str]) -> bool:
@@ -566,14 +554,17 @@ def _join_times(sheet: Sheet) -> None:
     clock = [sheet.named(*words) for words in _CLOCK_PARTS]
     if year is None or day is None or sheet.find("date") is not None:
         return
-    sheet.used |= {i for i in (*date, *clock) if i is not None}
+    sheet.used |= (columns := {i for i in (*date, *clock) if i is not None})
     parts = [np.zeros(len(sheet)) if i is None else sheet.numbers(i) for i in (year, month, day, *clock)]
     form = "{0:.0f}-{1:.0f}-{2:.0f}" if month is not None else "{0:.0f}-{2:03.0f}"
     form += "" if clock[0] is None else " {3:.0f}:{4:02.0f}:{5:09.6f}"
-    rows = zip(*parts, strict=True)
-    sheet.add(
-        "date", ["" if math.isnan(sum(row)) else form.format(row[0] + 2000 * (row[0] < 100), *row[1:]) for row in rows]
-    )
+    rows = ((row[0] + 2000 * (row[0] < 100), *row[1:]) for row in zip(*parts, strict=True))
+    dates = ["" if math.isnan(sum(row)) else form.format(*row) for row in rows]
+    # u-blox receivers write the time of week next to UTC
+    utc = sheet.find("gps_seconds") is not None or any("utc" in sheet.plain[i].split() for i in columns)
+    for i in columns:  # a column of seconds is not a clock
+        sheet.names[i] += " of the date"
+    sheet.add("date utc" if utc else "date", dates)
 
 
 # Latitude and longitude in one cell, in brackets or not: ``35.7275 -78.6960``; WKT has the longitude first.
@@ -737,13 +728,14 @@ class _Header:
 
     def adds_units(self, texts: list[str]) -> bool:
         """Check whether the line below the names contains units, perhaps with a datum, and add them to the names."""
-        texts = [text.strip("[]()") for text in texts]
+        texts = [" ".join(re.sub(r"[\[\]()]", " ", text).split()) for text in texts]
         filled = [text for text in texts if text]
         units = sum(
             any(map(dictionary.is_unit, (text, text.partition(" ")[0]))) or _BESIDE_UNITS.fullmatch(text) is not None
             for text in filled
         )
-        if len(texts) != len(self.names) or len(filled) < 2 or 2 * units <= len(filled):
+        few = len(filled) < 2 - any(map(dictionary.is_unit, filled))
+        if few or len(texts) != len(self.names) or 2 * units <= len(filled):
             return False
         self.names[:] = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, texts, strict=True)]
         return True
@@ -898,7 +890,7 @@ def _add_date_above(sheet: Sheet, time: int) -> None:
 
 # A time of day without a date.
 _OF_DAY = re.compile(r"T?\d{1,2}:\d\d[:\d.,]*([AP]M|Z)?$")
-_NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds", "header stamp nsecs", "header stamp nanosec")
+_NSECS = ("nsecs", "nsec", "nanosec", "nanosecs", "nanoseconds", "nano", "header stamp nsecs", "header stamp nanosec")
 _OF_CLOCK = ("date", "zone", "gps_week", "gps_seconds")
 # Start of a log in a cell of JSON, written by Open DroneLog together with relative times.
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
@@ -908,7 +900,7 @@ def _to_utc(timed: Rows, sheet: Sheet, column: int | None) -> None:
     """Convert times in place to UTC if the name of their column has a scale without leap seconds."""
     words = {*(() if column is None else sheet.plain[column].split())}
     scale = next((scale for scale in _stamps.SCALES_S if scale in words), None)
-    zoned = column is not None and any(_ZONED.search(text) for text in sheet.texts(column)[:3])
+    zoned = column is not None and any(dictionary.has("zoned", text) for text in sheet.texts(column)[:3])
     if scale is None or zoned or timed.relative or any("leap seconds" in text for text in timed.warnings):
         return
     timed.time = timed.time - np.timedelta64(_stamps.SCALES_S[scale], "s")
@@ -919,14 +911,14 @@ def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None
     """Return the best column of times: UTC if possible, and not the time of the last fix, which may stop."""
     column = sheet.find("time")
     # a column with an unknown name is a clock if its cells contain dates and times of day
-    dated = {i for i, text in enumerate(sheet.cells[0]) if _CLOCK.match(text)} if sheet.cells else {}
+    dated = {i for i, text in enumerate(sheet.cells[0]) if dictionary.has("dated", text)} if sheet.cells else {}
     times = [i for i, m in enumerate(sheet.meanings) if (m.quantity.name == "time" if m else i in dated)]
     if column is None or len(times) < 2:
         return column
     if "utc" not in sheet.plain[column].split():
         utc = [i for i in times if "utc" in sheet.plain[i].split()]
-        zoneless = all(map(_ZONELESS.fullmatch, sheet.texts(column)[:3]))
-        both = [i for i in utc if zoneless and all(_ZONELESS.match(text) for text in sheet.texts(i)[:3])]
+        zoneless = all(map(dictionary.PATTERNS["zoneless"].fullmatch, sheet.texts(column)[:3]))
+        both = [i for i in utc if zoneless and all(dictionary.has("zoneless", text) for text in sheet.texts(i)[:3])]
         column = next(iter(utc if "local" in sheet.plain[column] else both), column)
     time_of = dictionary.QUANTITIES[0]
     ranked = sorted(times, key=lambda i: dictionary.rank_of(time_of, sheet.plain[i]))
@@ -959,7 +951,7 @@ def _is_dated(sheet: Sheet, column: int) -> bool:
 
 
 # A clock has stopped if another clock advances by more than this while its time does not change [s].
-_STANDS_S = 2.0
+_STANDS_S = 0.5
 
 
 def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: ReadOptions) -> bool:
@@ -993,9 +985,10 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and day != column and not _stamps.is_dated(next(filter(None, texts), "")):
         if dictionary.meaning(sheet.names[day]) is None:
             sheet.notes[day] = f"column {sheet.names[day]!r} is read as the dates of the times, a guess from its cells"
-        pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
-        texts = [f"{date} {time}".strip() for date, time in pairs]
-    half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if _AM_PM.fullmatch(cell)]
+        # a spreadsheet may show a date only where it changes
+        dates: Iterator[str] = accumulate(sheet.texts(day), lambda before, date: date or before)
+        texts = [f"{date} {time}".strip() for date, time in zip(dates, sheet.texts(column), strict=True)]
+    half = [i for i, cell in enumerate(sheet.cells[0] if sheet.cells else ()) if dictionary.has("am_or_pm", cell)]
     if half:
         sheet.used.add(half[0])
         texts = [" ".join(pair) for pair in zip(texts, sheet.texts(half[0]), strict=True)]
@@ -1029,16 +1022,17 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         zone, texts = _zone_column(sheet, beside, zone, texts, options)
     gps = re.search(r"\bgps", name) is not None
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
-    first = _DAY_OR_MONTH.search(heads)
+    first = dictionary.PATTERNS["day_or_month"].search(heads)
     european = sheet.has_decimal_commas or dictionary.has("european", heads) or f"{options.timezone}"[:7] == "Europe/"
     read = partial(
         _stamps.read, unit=count, european=bool(european), zone=zone, gps=gps,
         day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
     )  # fmt: skip
-    if day is not None and len({*sheet.texts(day)}) == 1 and _stamps.passes_midnight(clocks := sheet.texts(column)):
+    days = [] if day is None else [*filter(None, sheet.texts(day))]
+    if day is not None and len({*days}) == 1 and _stamps.passes_midnight(clocks := sheet.texts(column)):
         text = "the dates are all equal, but the clock passes midnight: a day was added to the times after it"
         sheet.notes[day] = f"column {sheet.names[day]!r}: {text}"
-        dated = replace(options, time_origin=read(sheet.texts(day)[:1], options)[1][0].decode()[:10])
+        dated = replace(options, time_origin=read(days[:1], options)[1][0].decode()[:10])
         clock, cells, warnings = read(clocks, dated)
         return clock, cells, [text for text in warnings if "time_origin" not in text]
     return read(texts, options)
@@ -1075,16 +1069,8 @@ def _zone_column(sheet: Sheet, column: int, zone: str, texts: list[str], options
     return "", [text if _NUMBER.fullmatch(text) else f"{text} {own}".strip() for text, own in both]
 
 
-# Names of times since the start of a log, which may be written like times of the day.
-_ZONED = re.compile(r":\d\d(?:\.\d+)?(?:Z|[+-]\d\d:?\d\d)$")
 # Epochs, and times with an offset.
 _DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
-_CLOCK = re.compile(r"\d{4}-\d\d-\d\d.\d\d:\d\d")
-_ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
-# A cell of a column that contains only AM or PM.
-_AM_PM = re.compile(r"[AaPp]\.?[Mm]\.?")
-# The order of day and month in a column name such as 'date (dd/mm/yyyy)'.
-_DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 
 _OF_LEVELS = ("", "dBm", "dB", "dB re full scale")

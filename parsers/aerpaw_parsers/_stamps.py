@@ -33,14 +33,7 @@ _GAP = r"[T _,.:;-]{1,3}(?:(?:at|@) )?"
 _DAY = r"(?:[^\W\d_]{2,10}[., ]{1,3})?"  # a day of the week in any language
 _WORD = r"(?P<word>[^\W\d_]{3,10})\.?"
 # The date before the clock; date(1) writes the year and the zone after it.
-_DATES = (
-    r"(?P<year>\d{4})[-/._ ]{1,2}(?P<month>\d{1,2})[-/._ ]{1,2}(?P<day>\d{1,2})",
-    rf"(?P<year>\d{{4}})[-/._ ]?{_WORD}[-/._ ]?(?P<day>\d{{1,2}})",
-    r"(?P<a>\d{1,2})(?P<mark>[-/.])(?P<b>\d{1,2})(?P=mark)(?P<c>\d{4}|\d\d)",
-    rf"(?P<day>\d{{1,2}})[-/._ ]{{0,2}}(?:de )?{_WORD}[-/._, ]{{0,2}}(?:de )?(?P<year>\d{{4}}|\d\d)",
-    r"(?P<year>\d{4})[-/: ](?P<of_year>(?!000)(?:[0-2]\d\d|3[0-5]\d|36[0-6]))",
-    rf"{_WORD}[ -](?P<day>\d{{1,2}})(?:st|nd|rd|th)?[, -]{{1,2}}(?P<year>\d{{4}})",
-)
+_DATES = tuple(form.replace("WORD", _WORD) for form in dictionary.DATES)
 _DIGITS = re.compile(
     r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d):?(?P<minute>\d\d):?(?P<second>\d\d)"
     r"(?:\.?(?P<fraction>\d{1,40}))?" + _ZONE
@@ -498,6 +491,12 @@ def _numbers(
 ) -> tuple[str, AnyArray, list[str]]:
     """Return numbers as epochs if they are large enough, else as relative times."""
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
+    for what, (zero, *numbers) in dictionary.DAY_NUMBERS.items():
+        low, high, per_day = map(float, numbers)
+        if unit is None and len(value) > 2 and _are_days(value / per_day, low, high):
+            zone = "UTC" if "UTC" in what else zone
+            text = f"the times are {what}: read as {zone or 'local'} dates and times"
+            return "wall", _wall_cells(np.datetime64(zero, "us"), value / per_day * 86_400.0, zone, options), [text]
     step, likely = _step(value), _likely_units(value, _LEAST_STEPS)
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
         # 0.9e9 s is July 1998; smaller numbers, and numbers with steps of odd hours, have another origin
@@ -509,10 +508,6 @@ def _numbers(
             if gps and epoch_s < _GPS_S_OF[1]:
                 value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
             return (form, value, warnings) if form else ("epoch_us", value / 1e3, warnings)
-    for zero, low, high, program in _DAY_NUMBERS:
-        if unit is None and len(value) > 2 and _are_days(value, low, high):
-            text = f"the times are day numbers of {program}: read as {zone or 'local'} dates and times"
-            return "wall", _wall_cells(np.datetime64(zero, "us"), value * 86_400.0, zone, options), [text]
     if unit is not None:
         return f"relative_{unit}", value, []
     whole, of_day = not (value % 1 > 0).any(), 86_400 < middle < 86_400_000
@@ -561,8 +556,6 @@ SCALES_S = {"gpst": LEAP_S, "gpstime": LEAP_S, "tai": 37}
 # GPS time of January 2018 and of February 2030. Read as epochs, they are in 2008 and 2020.
 _GPS_S_OF = (1.2e9, 1.58e9)
 _GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were subtracted"
-# Date of day number zero, and the range of day numbers for the years 2000 to 2099.
-_DAY_NUMBERS = (("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"), ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"))
 
 
 def _are_days(value: FloatArray, low: float, high: float) -> bool:

@@ -31,9 +31,6 @@ from . import _cells, _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel
 _IsHeader = Callable[[list[str]], bool]
 # A tower of AERPAW in the name of a column, and its channel.
 _TOWER = re.compile(r"\b(lw|cc) ?([1-5])\b(?: ?(usrp) ?(\d)\b)?")
-# Values with which the columns "serving", "neighbouring" and "technology" mark cells as not serving or serving.
-_NO, _YES = ("false", "0", "no", "", "n/a", "none", "null", "nan", "-"), ("true", "1", "yes")
-_NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
 
 
 def is_header(names: list[str]) -> bool:
@@ -163,12 +160,15 @@ _FIELDS = {quantity: name for name, quantity in _cells.QUANTITIES.items()}
 
 
 def _part(sheet: _sheet.Sheet, column: int) -> str:
-    """Return the part of the level in a column, ``mean`` also for a statistic of another level by its values."""
+    """Return the part of the level in a column, ``mean`` also for a statistic of another level, or ``raw``."""
     own = sheet.meanings[column]
     if own is None or own.part or own.quantity.role != "rss" or own.indirect:
         return own.part if own else ""
     named = {m.place for m in sheet.meanings if m and (m.quantity.name == "PCI" or m.quantity.role == "mark")}
     like = {i: m for i, m in enumerate(sheet.meanings) if m and (m.quantity, m.rat) == (own.quantity, own.rat)}
+    # a raw level next to a calibrated one has an unknown offset
+    if dictionary.has("raw", sheet.plain[column]) and any(dictionary.has("calibrated", sheet.plain[i]) for i in like):
+        return "raw"
     free = [i for i, what in like.items() if what.place in {"serving", *({*_UNNAMED} - named)}]
     raw = [i for i in free if column in free and _cells.is_statistic_of(sheet.numbers(i), sheet.numbers(column))]
     if raw:
@@ -182,7 +182,7 @@ def _preference(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int
     known = sheet.numbers(column)
     count = len(np.unique(known[np.isfinite(known)]))
     part = _part(sheet, column)
-    return part == "mean", part == "port", _MORE.sub("", sheet.plain[column]).strip() != "", -count
+    return part in ("mean", "raw"), part == "port", _MORE.sub("", sheet.plain[column]).strip() != "", -count
 
 
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
@@ -288,7 +288,7 @@ def _of_one_phone(readings: pd.DataFrame, time: AnyArray) -> pd.DataFrame:
 def _idle(sheet: _sheet.Sheet) -> BoolArray:
     """Return the rows whose cell does not serve, in tables with one cell per row."""
     idle = np.zeros(len(sheet), dtype=bool)
-    for name, words in (("serving", _NO), ("neighbouring", _YES), ("technology", _NEIGHBOURS)):
+    for name, words in dictionary.IDLE.items():
         if (column := sheet.find(name)) is not None:
             idle |= np.array([text.lower() in words for text in sheet.texts(column)], dtype=bool)
     return idle
@@ -422,10 +422,10 @@ def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
 
 
 def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
-    """Check whether a column is the mean of a level that is another column of the table, or one of several means."""
+    """Check whether a column is the mean of another level, one of several means, or raw next to a calibrated level."""
     own = sheet.meanings[column]
     if own is None or not own.part:
-        return _part(sheet, column) == "mean"
+        return _part(sheet, column) != ""
     others = (what for what in sheet.meanings if what is not None and what is not own and not what.indirect)
     return any(
         (m.quantity, m.rat, m.place) == (own.quantity, own.rat, own.place)
@@ -587,7 +587,7 @@ def _other(rows: Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream 
         return snr_stream(rows, about["node"], values)
     where, unit = np.isfinite(values), sheet.unit_read(column)
     if _is_statistic(sheet, column):
-        about["statistic"] = "mean"
+        about["statistic"] = "raw" if _part(sheet, column) == "raw" else "mean"
     return _cells.named(rows, name, values, unit=unit, where=where, about=about, alone=alone)
 
 

@@ -58,8 +58,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         lines, row, column, options, reader="nemo_kml", others=others,
         clock="relative_s" if in_seconds else "relative_ms",
     )  # fmt: skip
-    if in_seconds:
-        rows.warnings.append("with times in ms the phone would fly faster than any aircraft: read as seconds")
+    rows.warnings += ["with times in ms the phone would fly faster than any aircraft: read as seconds"] * in_seconds
     position = {name: rows.number(name) for name in _POSITION}
     about: _pose.Height = {}
     if np.isfinite(position["altitude_m"]).any():

@@ -21,18 +21,10 @@ BATCHES = sorted((Path(__file__).parent / "blind").glob("batch_*.yaml"))
 NAMES = {"dB re full scale": "dBFS", "sea": "sea level", "takeoff": "take-off"}
 
 
-def read(path, reader=None, **options):
-    (file,) = ingest([path], options=ReadOptions(**options), reader=reader)
-    assert file.result.lines == file.result.accepted + len(file.result.rejected) + file.result.blank
-    return file.result
-
-
-def valid(streams, kind, column):
-    """Return the streams of a kind that have valid rows: attributes, number of these rows, the first and the last."""
-    streams = [
-        (s, s.frame[s.frame["flag"].isin(["", "no_fix"])].dropna(subset=column)) for s in streams if s.kind == kind
-    ]
-    return [(s.attributes, len(f), f.sort_values("time", kind="stable").iloc[[0, -1]]) for s, f in streams if len(f)]
+def valid(streams, column):
+    """Return the streams that have valid rows: attributes, number of these rows, the first and the last."""
+    frames = [(s, s.frame[s.frame["flag"].isin(["", "no_fix"])].dropna(subset=column)) for s in streams]
+    return [(s.attributes, len(f), f.sort_values("time", kind="stable").iloc[[0, -1]]) for s, f in frames if len(f)]
 
 
 def far(wanted, values, most):
@@ -53,7 +45,7 @@ def faults_of(expect, streams, part=False):
         return [""] * any(stream.kind != "kpi" for stream in streams)
     faults = []
     for kind, column, doubt in (("rss", "rss_db", "level|power|unit|series"), ("rank", "rank", "rank")):
-        left, may = valid(streams, kind, column), expect.get("may", [])
+        left, may = valid([s for s in streams if s.kind == kind], column), expect.get("may", [])
         for one in expect.get(kind, []) + may:
             (first, low), (last, high) = one["first"], one["last"]
             same = [s for s in left if s[1] in np.ravel(one["rows"]) and not far([low, high], s[2][column], 0.06)]
@@ -65,46 +57,43 @@ def faults_of(expect, streams, part=False):
                 left = [s for s in left if s is not same[0]]
         faults += [doubt] * bool(left)
     if (track := expect.get("track")) and not part:
-        attributes, count, rows = next(iter(valid(streams, "telemetry", "latitude_deg")), ({}, 0, None))
+        tracks = [s for s in streams if s.kind == "telemetry"]
+        attributes, count, rows = next(iter(valid(tracks, "latitude_deg")), ({}, 0, None))
         if rows is None or far(track["first"], rows[["latitude_deg", "longitude_deg"]].iloc[0], 2e-6):
             return [*faults, "position"]
-        height = rows["altitude_m"].iloc[:1] + attributes.get("height_taken_off_m", 0.0)
-        datums = (None, attributes.get("height_datum", "take-off"))
-        other = "height_m" in track and (
-            far([track["height_m"]], height, 0.1) or NAMES.get(track["height"], track["height"]) not in datums
-        )
+        height, zero = rows["altitude_m"].iloc[:1] + attributes.get("height_taken_off_m", 0.0), track.get("height")
+        zeros = (None, attributes.get("height_datum", "take-off"))
+        other = "height_m" in track and (far([track["height_m"]], height, 0.1) or NAMES.get(zero, zero) not in zeros)
         faults += ["position"] * (count != track.get("rows", count)) + ["altitude|height"] * other
         faults += late([track["start"], track["end"]], rows)
     return faults
 
 
-def judged(expect, path, part=False, **options):
-    result = read(path, **options)
+def tried(expect, path, part=False, reader=None, **options):
+    """Return the verdict on one way to read a table, with the differences and the words of the reader."""
+    try:
+        result = ingest([path], options=ReadOptions(**options), reader=reader)[0].result
+    except (InputError, UsageError) as error:
+        return "refused", str(error)
+    assert result.lines == result.accepted + len(result.rejected) + result.blank
     faults = faults_of(expect, result.streams, part)
     named = all(any(re.search(fault, warning) for warning in result.warnings) for fault in faults)
     return "right" if not faults else "warned" if named else "wrong", f"{faults} {[*result.warnings]}"
 
 
 def verdict(entry, folder):
-    """Read a table as its owner would: as it is, then with the answer to the reader's question, then as the reader proposes."""
+    """Read a table as it is, then with the answer to the question of the reader, then as the reader proposes."""
     path, expect = folder / entry["file"], entry.get("expect")
     text = entry["text"].replace("\n", "\r\n" if entry.get("newline") == "crlf" else "\n")
     path.write_bytes(text.encode(entry.get("encoding", "utf-8")))
-    answers = [entry.get("options", {}), *([entry["remedy"]] if "remedy" in entry else [])]
-    for options in answers:
-        try:
-            found, words = judged(expect, path, **options)
-            break
-        except (InputError, UsageError) as error:
-            found, words = "right" if "ask" in entry and len(answers) == 1 else "refused", str(error)
+    found, words = tried(expect, path, **entry.get("options", {}))
+    if found == "refused" and "ask" in entry:
+        found, words = tried(expect, path, **entry["remedy"]) if "remedy" in entry else ("right", words)
     pairs = [f"{column}={quantity}" for column, quantity in re.findall(r"--map '(.*?)'=(\w+)", words)]
     if found != "wrong" and pairs and expect:
-        unit = re.search(r"--unit (\w+)", words)
-        options = {**mapping(pairs), "unit": unit and unit[1], "timezone": "UTC"} | answers[-1]
-        try:
-            after, more = judged(expect, path, part=True, reader="generic_csv", **options)
-        except (InputError, UsageError) as error:
-            after, more = "refused", str(error)
+        unit, answers = re.search(r"--unit (\w+)", words), entry.get("remedy", entry.get("options", {}))
+        options = {**mapping(pairs), "unit": unit and unit[1], "timezone": "UTC"} | answers
+        after, more = tried(expect, path, part=True, reader="generic_csv", **options)
         return "wrong" if after == "wrong" else found, f"{words} THEN {after} {more}"
     return found, words
 

@@ -100,7 +100,6 @@ def test_autopilots_and_the_tap_keep_who_and_how_high(name: str) -> None:
 
 # --- cousins: other words, orders, separators, programs and zones ------------------------------------------------------
 
-PLACE = "35.728000{i},-78.696000{i}"
 EPOCH = "174956400{i}"
 
 
@@ -142,18 +141,6 @@ def test_a_hover_at_the_start_is_no_ground(name: str, heights: list[float], grou
     np.testing.assert_allclose(shown, np.array(heights) - ground)
 
 
-@pytest.mark.parametrize(
-    ("head", "row", "refusal"),
-    [("time,power", EPOCH + ",5.9e-0{i}", "between 0 and 1"), ("time,value,field", EPOCH + ",{l},rsr{k}", "long form")],
-)
-def test_mapped_numbers_that_are_no_levels_are_refused(head: str, row: str, refusal: str, tmp_path: Path) -> None:
-    rows = [row.format(i=i, l=-90, k="pq"[i % 2]) for i in range(1, 5)]
-    (tmp_path / "x.csv").write_text("\n".join([head, *rows, ""]))
-    with pytest.raises(InputError) as refused:
-        read(tmp_path / "x.csv", ("time=time", f"{head.split(',')[1]}=rss_db"), {})
-    assert refusal in str(refused.value)
-
-
 BAD = yaml.load((CASES / "refused.yaml").read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
 PLAN = (Path(__file__).parents[2] / "sample_logs/flight.yaml").read_text()
 BAD["a plan in YAML, whose lines have equally many words"] = {"text": PLAN, "words": "settings of a flight"}
@@ -161,23 +148,10 @@ BAD["a plan in YAML, whose lines have equally many words"] = {"text": PLAN, "wor
 
 @pytest.mark.parametrize("name", BAD)
 def test_what_cannot_be_read_is_refused_with_its_cause(name: str, tmp_path: Path) -> None:
-    (tmp_path / "table.csv").write_text(BAD[name]["text"], encoding=BAD[name].get("encoding", "utf-8"))
-    with pytest.raises(UsageError if "usage" in BAD[name] else InputError, match=BAD[name]["words"]):
-        read(tmp_path / "table.csv", (), {})
-
-
-def test_a_header_and_a_mapping_that_disagree_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.csv").write_text(table("time,p [dBm],h [deg],lat,lon", f"{EPOCH},{{l}},1,{PLACE}"))
-    place = ("time=time", "p [dBm]=rss_db", "lat=latitude_deg", "lon=longitude_deg")
-    with pytest.raises(UsageError, match="is in deg and mapped to altitude_m"):
-        read(tmp_path / "x.csv", (*place, "h [deg]=altitude_m"), {})
-    with pytest.raises(UsageError, match="'lon' means longitude_deg, but it is mapped to latitude_deg"):
-        read(tmp_path / "x.csv", (*place[:2], "lon=latitude_deg", "lat=longitude_deg"), {})
-    (tmp_path / "y.csv").write_text(table("time,cqi", f"{EPOCH},2"))
-    with pytest.raises(UsageError, match="'cqi' means CQI, but it is mapped to ri_raw"):
-        read(tmp_path / "y.csv", ("time=time", "cqi=ri_raw"), {"ri_base": "one"})
-    with pytest.raises(UsageError, match="is in dBm, but --unit is"):
-        read(tmp_path / "x.csv", place, {"unit": "dB re full scale"})
+    bad = BAD[name]
+    (tmp_path / "table.csv").write_text(bad["text"], encoding=bad.get("encoding", "utf-8"))
+    with pytest.raises(UsageError if "usage" in bad else InputError, match=bad["words"]):
+        read(tmp_path / "table.csv", tuple(bad.get("maps", ())), bad.get("options", {}))
 
 
 def test_the_summary_beside_a_log_says_its_hours_and_its_name_does_not(tmp_path: Path) -> None:

@@ -91,12 +91,6 @@ def test_gpxpy_reads_the_same_points() -> None:
     assert np.allclose(frame["altitude_m"], [point.elevation - timed[0].elevation for point in timed])
 
 
-def test_a_gpx_without_times_is_no_aborted_run(tmp_path: Path) -> None:
-    (tmp_path / "a.gpx").write_text('<gpx><trk><trkseg><trkpt lat="35.7" lon="-78.7"></trkpt></trkseg></trk></gpx>\n')
-    with pytest.raises(InputError, match="a GPX track without times"):
-        ingest(tmp_path / "a.gpx")
-
-
 def test_an_rtklib_baseline_is_refused_with_the_option_that_makes_it_readable() -> None:
     data = (
         b"%  GPST   e-baseline(m)  n-baseline(m)  u-baseline(m)   Q  ns\n2025/03/02 15:00:18.0  1.0  2.0  3.0  1  12\n"
@@ -179,31 +173,6 @@ def test_an_autopilots_telemetry_radio_is_no_tower_beside_levels_of_the_experime
     text = (tmp_path / "flight.yaml").read_text().replace(", skip: [radio, radio_remote]", "")
     (tmp_path / "old.yaml").write_text(text)  # a flight file of before, whose autopilot logged the radio, too
     assert open_flight(tmp_path / "old.yaml").rss["tower"].unique().tolist() == ["LW1"]
-
-
-@pytest.mark.parametrize(
-    ("header", "hint"),
-    [
-        ("when,altitude - sea level (m),lte_asu,signalType", "no column looks like rss_db"),
-        ("when,battery_voltage,avg_power,power", "no column looks like rss_db"),
-        ("timestamp,ref_lat,ref_lon,ref_alt,x,y,z", "positions on a grid"),
-        ("time,freq_mhz,level_dbuv_m", "no column looks like rss_db"),
-        ("when,signal_percent,peak_power_dbfs", "no column looks like rss_db"),
-        ("start_date,up time,rx power", "--map 'up time'=time --map 'rx power'=rss_db"),
-        ("when_utc,y lat,x lon,strength", "--map 'when_utc'=time --map 'y lat'=latitude_deg"),
-    ],
-)
-def test_a_hint_proposes_what_can_be_typed_and_no_height_power_or_index(header: str, hint: str, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(f"{header}\n")
-    with pytest.raises(InputError) as refused:
-        ingest(tmp_path / "a.csv")
-    assert hint in str(refused.value)
-
-
-def test_positions_on_a_local_grid_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("t,unix_time,north_m,east_m,down_m\n0,1749564000,0,0,-30\n")
-    with pytest.raises(InputError, match="positions on a grid, such as column 'north_m'"):
-        ingest(tmp_path / "a.csv")
 
 
 def test_a_fix_type_of_one_has_no_position(tmp_path: Path) -> None:

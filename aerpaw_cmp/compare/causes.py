@@ -772,7 +772,7 @@ _JUMP_M, _FASTEST_MPS = 5.0, 25.0
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the log of another tower."""
     for name, level in e.other_towers_db.items():
-        sentence, step = f"the log is that of {name}", f"`node: {name}` in this `logs:` line"
+        sentence, step = f"the log comes from {name}", f"`node: {name}` in this `logs:` line"
         change_db, cost = level - e.predicted_db, math.log(len(e.other_towers_db))
         yield Trial(name="tower", cost=cost, sentence=sentence, next_step=step, change_db=change_db)
 

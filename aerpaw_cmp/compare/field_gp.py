@@ -218,7 +218,7 @@ class FieldFit:
 
     def __post_init__(self) -> None:
         if not len(self.rows):
-            raise InputError("no sample to condition on", expected="flights with levels at known poses")
+            raise InputError("no sample to learn from", expected="flights with levels at known poses")
 
     def predict(self, targets: Rows, parts: Collection[Part] = PARTS) -> tuple[FloatArray, FloatArray]:
         """Return mean and standard deviation (m,) of the selected parts at targets [dB]. NaN for targets with a NaN.

@@ -303,7 +303,7 @@ def _shown_without(bins: Mapping[str, _Bins], parts: Mapping[str, list[_Parts]],
 _NO_OVERLAP = "too few samples have a level and a position of the UAV at every lag of the window"
 _FLAT_LEVEL = "the level is constant although the model predicts a change"
 _ONE_PLACE = "only one fifth of the flight supports a clock shift"
-_HELD = "readings are repeated for up to {:.0f} s, so levels are late although the clock may be right"
+_HELD = "levels are repeated for up to {:.0f} s, so they are late although the clock may be right"
 _NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
 
 

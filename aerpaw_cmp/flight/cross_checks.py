@@ -110,7 +110,7 @@ def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
     first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
     if first and second and not first & second:
         (shown, other) = (" ".join(min(found)) for found in (first, second))
-        return f"its name has {shown}, the name of the track has {other}: which flight?"
+        return f"its name has {shown}, the name of the track has {other}: the same flight?"
     # trust absolute times more than a name, because an evening flight has the date of the next day in UTC
     if _span_of(file) is not None:
         return ""
@@ -119,7 +119,7 @@ def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
     if flown is not None:
         dates[1] |= {str(flown[0].astype("datetime64[D]") + day) for day in (-1, 0, 1)}
     if dates[0] and dates[1] and not dates[0] & dates[1]:
-        return f"its name has {min(dates[0])}, the date of the track is {max(dates[1])}: which flight?"
+        return f"its name has {min(dates[0])}, the date of the track is {max(dates[1])}: the same flight?"
     return ""
 
 
@@ -202,7 +202,7 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
         rivals = [i for away_m, i in others if away_m < max(_ALIKE * near_m, _ALIKE_M)]
         if rivals:
             called = " and ".join(_called(known[i]) for i in rivals)
-            text = f"its positions are also on the track of the flight {called}: which flight?"
+            text = f"its positions are also on the track of the flight {called}: the same flight?"
             known[best].unsure[file.path] = text
         return known[best]
     folder = Path(file.path).parent

@@ -337,7 +337,7 @@ def _tracked_node(
     up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.takeoff_ground_m, MINIMUM_HEIGHT_M)
     if logged and not np.isfinite(up).any():
         raise InputError(
-            "no heights in this log", expected=f"those of towers.{name}, which has height: logged", path=path
+            "no heights in this log", expected=f"heights of towers.{name}, which has height: logged", path=path
         )
     height_m = float(np.nanmedian(up)) if logged else node.antenna_height_m
     at = float(middle[0]), float(middle[1]), height_m
@@ -379,7 +379,7 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
         if len(frame):
             records: pd.DataFrame = frame.reindex(columns=["time", *_TELEMETRY])
             return records
-    raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
+    raise InputError("no positions in this log", expected=f"positions of towers.{name}", path=path)
 
 
 # All columns of telemetry except fix and number of satellites, which are not part of a pose.
@@ -940,7 +940,7 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
             raise UsageError(
                 f"{where} at the same time or with different properties: {path!r} and {later_path!r}",
                 expected="one record of each channel and of each tower's rank",
-                cause=f"{cause}; another radio: give it its own 'channel'",
+                cause=f"{cause}; for another radio, set a separate 'channel'",
             )
     # take values that are not per sample (link, unit) from the first part
     first = parts[0][1]

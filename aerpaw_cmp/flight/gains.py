@@ -309,7 +309,7 @@ class _Ends:
         """Use a learned antenna at the end that a key names. Channel None is the link of all other channels."""
         tower, link = key.partition(".")[0], self.link(channel)
         before = link.uav if key == "uav" else link.towers.get(tower, link.tower)
-        instead = "an isotropic antenna is used instead" if before == ArraySettings() else "that of 'link' is used"
+        instead = "an isotropic antenna is used instead" if before == ArraySettings() else "the 'link' antenna is used"
         try:
             file, known = learned_antenna(named, "uav" if key == "uav" else "tower", link.carrier_hz)
         except (InputError, UsageError) as error:

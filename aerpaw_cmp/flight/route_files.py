@@ -341,9 +341,7 @@ def _kml(data: bytes) -> _Route:
                 cause="a line drawn at one height",
             )
         route.points = [(*point[:2], point[2] - zero, *point[3:]) for point in route.points]
-        route.remark(
-            f"Heights are above sea level: that of the first point, {zero:.1f} m, is used as that of the take-off."
-        )
+        route.remark(f"Heights are above sea level: the height of the first point, {zero:.1f} m, is taken as zero.")
     return route
 
 

@@ -229,7 +229,7 @@ class TrackAccount:
             (self.bad_position, "telemetry row(s) without a position (NaN, -999) were ignored"),
             (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not interpolated"),
             (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course is assumed"),
-            (self.heading_alone, "telemetry row(s) contain only a heading: level flight along it is assumed"),
+            (self.heading_alone, "telemetry row(s) contain only a heading: level flight in its direction is assumed"),
             (
                 self.below_ground,
                 "telemetry row(s) are below the site's ground plane and are not compared: origin.takeoff_ground_m, or "
@@ -239,7 +239,7 @@ class TrackAccount:
         usual_m, high_m = self.sparse_error_m
         sparse = (
             f"the telemetry has a fix every {self.sparse_s:.0f} s: positions in between are interpolated, with a "
-            f"median error of about {usual_m:.0f} m and {high_m:.0f} m in one of ten"
+            f"median error of about {usual_m:.0f} m and {high_m:.0f} m in one case of ten"
         )
         return (*([sparse] if self.sparse_s else []), *(f"{count} {text}" for count, text in reasons if count))
 

@@ -46,7 +46,7 @@ _ATTITUDE_TOLERANCE_RAD = 1e-6
 # Largest number of links of all series together, but at least three per series. A link takes about 0.1 s.
 _REFERENCE_LINKS_AT_MOST = 64
 
-_TIMES = "Time: the part of the replay for the audited links. Time of the reference: with its start."
+_TIMES = "Time: the part of the replay for the audited links. Time of the reference: including its start."
 
 # Errors that an audit of the replay cannot detect.
 _NOT_COVERED = (

@@ -528,7 +528,7 @@ def _unscored(observed: Sequence[Observed]) -> list[str]:
     """Return a remark about channels of towers that cannot be scored, because only one flight has them."""
     flights = calibration.flights_of(observed)
     if len(flights) < 2:
-        return ["only one flight: no flight can be held out, so nothing is scored, and mounts are unstable"]
+        return ["only one flight: no flight can be held out, so nothing is scored, and mount angles are unreliable"]
     heard = {(o.samples.antenna, o.samples.flight) for o in observed}
     count = Counter(antenna for antenna, _ in heard)
     lonely = [antenna for antenna in dict.fromkeys(o.samples.antenna for o in observed) if count[antenna] == 1]

@@ -148,7 +148,7 @@ def _moving(data: FlightData, chosen: ChannelOptions, towers: Sequence[str], rem
     spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # a long step is not a gap
     velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
     if not np.isfinite(velocity).any():
-        remarks.append("No Doppler shift: no point has a neighbour in time, so the UAV has no velocity.")
+        remarks.append("No Doppler shift: no point has a neighbour in time, so the velocity of the UAV is unknown.")
         return along
     other = None if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)
     return replace(along, velocity_mps=velocity, tower_mps=other)

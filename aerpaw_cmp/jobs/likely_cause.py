@@ -165,7 +165,7 @@ _FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
 
 SIMULATED = Cause(
     name="emulator",
-    sentence="The log is a simulator's: receiver and battery (fix 6, 10 satellites, few voltages) are ArduPilot's.",
+    sentence="A simulator wrote the log: receiver and battery (fix 6, 10 satellites, few voltages) are ArduPilot's.",
     next_step="do not draw conclusions about the site from this flight",
 )
 

@@ -200,7 +200,7 @@ def _busy(path: Path, others: list[Holder]) -> InputError:
         who += f" and {len(others) - 4} more"
     if any(h.name == "ModemManager" for h in others) or (not others and modem_manager()):
         cause = (
-            "ModemManager took it. Free it now with 'sudo systemctl stop ModemManager', for good with the udev rule "
+            "ModemManager uses it. Free it now with 'sudo systemctl stop ModemManager', permanently with the udev rule "
             'ATTRS{idVendor}=="2c7c", ENV{ID_MM_DEVICE_IGNORE}="1"'
         )
     elif others:

@@ -462,5 +462,5 @@ def _refused(address: Address, error: OSError) -> UsageError:
         errno.EADDRNOTAVAIL: "this computer has no such address",
     }.get(error.errno or 0, "the name of another computer")
     taken = error.errno == errno.EADDRINUSE
-    expected = "a free port; 0 takes any" if taken else f"an address of this computer, e.g. {DEFAULT}"
+    expected = "a free port; 0 selects one" if taken else f"an address of this computer, e.g. {DEFAULT}"
     return UsageError(f"--web {address}: {error.strerror}", expected=expected, cause=cause)

@@ -513,7 +513,7 @@ class _Check:
         lost[height.index] = np.repeat([False, *back, False], np.diff(begins, append=len(height)))
         if 0 < lost.mean() <= _FEW_JUMPS_SHARE:
             first = f"{height[int(np.argmax(lost))]:g} m"
-            self._flag(lost, "height_lost", first, "a leap and a return beyond any climb", [PLACE[2]])
+            self._flag(lost, "height_lost", first, "a jump and return faster than any climb", [PLACE[2]])
 
     def _near_in_time(self) -> None:
         """Flag a few time stamps that are more than a day from all other time stamps."""
@@ -539,7 +539,7 @@ class _Check:
         bad[order[few[group]]] = True
         if bad.any():
             row = int(np.argmax(bad))
-            why = "written before the clock was set" if stamp[row] < _CLOCK_SET_NS else "days from all others"
+            why = "written before the clock was set" if stamp[row] < _CLOCK_SET_NS else "days from all other records"
             self._flag(bad, "time_out_of_range", np.datetime_as_string(time[row], unit="s"), why)
 
 

@@ -26,7 +26,7 @@ from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
 _NO_DATE = "the time stamp is not a date of the calendar"
 _UNREAD = "the time is empty or has an unsupported form"
-NO_TIME = "the time is beyond any flight"
+NO_TIME = "the time is outside the years of any flight"
 _SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
 Reason = Callable[[bytes], "str | None"]
 

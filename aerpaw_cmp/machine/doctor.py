@@ -128,7 +128,7 @@ def llvm_checks() -> Iterator[Check]:
             remedy = llvm.install_line() if trial.missing else "make setup"
             yield Check("LLVM", "fail", f"{name} could not be tried: {trial.reason}", remedy)
         else:
-            remedy = "none needed, another one works" if works else llvm.remedy(trials)
+            remedy = "not needed, because another library works" if works else llvm.remedy(trials)
             yield Check("LLVM", "warn" if works else "fail", f"{name}: {trial.reason}", remedy)
 
 

@@ -215,12 +215,12 @@ class _Projection:
         flat = np.exp(log_rates[1]) * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3
         reasons = {
             # Bayesian information criterion with a penalty for two more coefficients
-            "one exponential fits as well": n * np.log(ratio) - 2 * np.log(n) <= 0,
+            "a single exponential fits as well": n * np.log(ratio) - 2 * np.log(n) <= 0,
             "one of the two exponentials has no amplitude": min(c1, c3) <= 1e-3 * max(c1, c3),
             # two rates within 5 % are in effect a single exponential
             "both exponentials decay at the same rate": log_rates[0] - log_rates[1] < 0.05,
             "the faster decay ends before the first distance, so its rate cannot be determined": at_end,
-            "the slower decay does not show within the largest distance": flat,
+            "the slower decay is not visible within the largest distance": flat,
         }
         return self.curve(log_rates, [text for text, applies in reasons.items() if applies])
 

@@ -103,7 +103,7 @@ def _failure() -> str:
     if find_spec("numba") is None:
         return "numba is not installed (pip install 'aerpaw-cmp[fast]')"
     if os.path.lexists(".numba_config.yaml"):  # such a file can make numba write files
-        return "the working folder contains a .numba_config.yaml, which numba would obey"
+        return "the working folder contains a .numba_config.yaml, which numba would apply"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba warns about its cache

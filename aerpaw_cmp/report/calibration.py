@@ -230,7 +230,7 @@ def scores_card(data: CalibrationData) -> Card:
     keys = ("rmse_db", "rmse_4s_db", *BASELINES)
     means = Table(
         caption="RMSE in dB after one offset per flight and channel, mean over flights and channels. A dash means that "
-        "it could not be held out. Controls are the same fit in a wrong frame, and without measured patterns.",
+        "these data could not be held out. Controls are the same fit in a wrong frame, and without measured patterns.",
         columns={"Held out": HEAD, **each, **baselines, "channels": 0},
         rows=[(SPLIT_TITLE.get(name, name), *(_mean(of, key) for key in keys), len(of)) for name, of in rows.items()],
     )

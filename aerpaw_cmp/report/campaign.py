@@ -287,7 +287,7 @@ CAUSES: dict[str, tuple[str, str]] = {
         "compare the flights before and after it separately; check the gain of that receiver",
     ),
     "none": (
-        "No flight and no link stands out. Largest error: {flight}, {error:.1f} dB ({link}).",
+        "No flight or link stands out. Largest error: {flight}, {error:.1f} dB ({link}).",
         "open the report of {flight}",
     ),
 }

@@ -306,8 +306,8 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
         rows=[list(node.values()) for node in verdict["nodes"]],
     )
     ranks = Table(
-        caption="Ranks on the same samples. A log score [nat] is better if it is lower; the last column is that of "
-        "the mean probabilities.",
+        caption="Ranks on the same samples. A log score [nat] is better if it is lower; the last column is the score "
+        "of the mean probabilities.",
         columns={"Tower": HEAD, "Model": TEXT, "Samples": 0, "Kappa": 2, "Total variation": 3, "Agreement": SHARE,
                  "Log score": 3, "Log score of the mean": 3},
         rows=[
@@ -380,8 +380,8 @@ def models_card(data: ReportData) -> Card:
     )  # fmt: skip
     text = (
         f"{words.models_verdict(data.models)} The flight is divided into eight areas. Each area is scored with the "
-        "offset of the other seven; nothing else is fitted. Each stage (antennas, trees, ground, buildings) adds its "
-        "variants to the best model so far."
+        "offset of the other seven areas; nothing else is fitted. Each stage (antennas, trees, ground, buildings) adds "
+        "its variants to the best model so far."
     )
     return Card(
         title=title, id="ladder", link="Models", text=[text], tables=[pooled],
@@ -433,7 +433,7 @@ def _audited_paths(a: results.AuditResult) -> Table:
         caption="Paths and levels of the two engines on the same links, which are spread over all channels.",
         columns={"Reference": HEAD, "Links": 0, "Paths missing": 0,
                  "Paths that Sionna RT did not sample": 0, "Largest RSS difference [dB]": 3,
-                 **{f"Other rank at K = {k_key(k)}": RIGHT for k in a.rank_disagreement},
+                 **{f"Different rank at K = {k_key(k)}": RIGHT for k in a.rank_disagreement},
                  "Time": RIGHT, "Time of the reference": RIGHT},
         rows=[(a.reference, a.links, a.missing_paths, a.extra_paths, a.rss_max_error_db,
                *(percent(share, 1) for share in a.rank_disagreement.values()),

@@ -400,7 +400,7 @@ def cautions(data: ReportData) -> list[str]:
             + "."
         )
     if data.synthetic:
-        texts.append("The logs are synthetic: they were simulated to show the tool and are not a measurement.")
+        texts.append("The logs are synthetic: they were simulated to demonstrate the tool, not measured.")
     texts += [f"{text}." for text in data.doubts]
     for panel in data.rss:
         texts += _rss_cautions(panel)

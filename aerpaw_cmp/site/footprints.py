@@ -244,7 +244,7 @@ def _sort(
     if skipped:
         listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
         more = "" if len(skipped) <= 5 else f" and {counted(len(skipped) - 5, 'other tag')}"
-        hint = "; '--untagged building' takes areas without tags for buildings" if skipped["untagged"] else ""
+        hint = "; '--untagged building' treats areas without tags as buildings" if skipped["untagged"] else ""
         actions.append(f"{name}: left out, no building or forest above the ground: {listed}{more}{hint}")
 
 

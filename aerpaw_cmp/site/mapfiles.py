@@ -515,7 +515,7 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
     if lines[""] and not lines["outer"] and not lines["inner"]:
         outer, inner = _by_nesting(_join_rings(lines[""], outline))
         if inner:
-            outline.broken.append("its members have no roles; rings inside another are taken for holes")
+            outline.broken.append("its members have no roles; rings inside another are treated as holes")
     else:
         outer, inner = _join_rings(lines["outer"] + lines[""], outline), _join_rings(lines["inner"], outline)
     if not outer and not outline.broken:

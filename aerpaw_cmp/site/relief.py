@@ -376,10 +376,10 @@ def _read_geotiff(data: bytes, frame: SiteFrame) -> Dem:
     step_east, shear_east, west, shear_north, step_north, north = notes["transform"]
     # a raster with north up has a negative step to the north, because rows run south
     if notes["crs"] is None or shear_east or shear_north or step_east <= 0 or step_north >= 0:
-        raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so")
+        raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp can convert it")
     # units foot, feet and ft
     if unit.startswith(("f", "us survey f")):
-        raise InputError(f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts")
+        raise InputError(f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts it")
     band = _plausible(band)
     west += step_east / 2
     south = north + step_north * (band.shape[0] - 0.5)
@@ -533,7 +533,7 @@ def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float
     for i, j in sorted(cKDTree(place).query_pairs(_SAME_PLACE_M)):
         if abs(height[i] - height[j]) > _CONTRADICTION * np.hypot(error[i], error[j]):
             raise UsageError(
-                f"ground_points {i + 1} and {j + 1} contradict: {height[i]:g} and {height[j]:g} m at one place "
+                f"ground_points {i + 1} and {j + 1} disagree: {height[i]:g} and {height[j]:g} m at one place "
                 f"({place[i, 0]:g} m east, {place[i, 1]:g} m north)",
                 expected=f"heights at one place within {_CONTRADICTION:g} standard deviations",
                 cause="another vertical datum, or an error that is too small",

@@ -1014,7 +1014,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and not zone and "local" not in name:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
     if day is not None and "local" in sheet.names[day].lower() and zone == "UTC":
-        text = "dates are local but times are UTC: between midnight in the two zones, the date is wrong by a day"
+        text = "dates are local but times are UTC: between their midnights, the date is wrong by a day"
         if _stamps.passes_midnight(sheet.texts(column)):
             raise InputError(text, expected="dates and times of one zone", cause="two clocks in one table")
         sheet.notes[day] = f"columns {sheet.names[day]!r} and {sheet.names[column]!r}: {text}"

@@ -222,7 +222,7 @@ def _powers(
             warnings.append(f"USRP{i + 1}: {share:.1%} of the values are at full scale: clipped, levels are too low")
         if dc_db > _DC_DB:
             reason = "the receiver's own offset, or a carrier at the centre frequency"
-            warnings.append(f"USRP{i + 1}: its levels are those of a DC part {dc_db:.0f} dB above the rest ({reason})")
+            warnings.append(f"USRP{i + 1}: levels are dominated by a DC part {dc_db:.0f} dB above the rest ({reason})")
     rows = _rows_of(list(stamps), options)
     rows.time = rows.time + np.round(np.array(later_s)[rows.at] * 1e9).astype("timedelta64[ns]")
     for i in range(level.shape[1]):

@@ -98,7 +98,7 @@ def test_readings_that_are_repeated_are_late_although_the_clock_is_right(held_s,
     held = dataclasses.replace(known, measured_db=known.measured_db[np.searchsorted(period, period)])
     clock = judge_clock([held])
     assert clock.verdict == verdict
-    assert clock.reason.startswith("readings are repeated for up to 10 s") == (verdict == CANNOT_TELL)
+    assert clock.reason.startswith("levels are repeated for up to 10 s") == (verdict == CANNOT_TELL)
     assert bool(clock.correction_s) == (verdict == SHIFTED)
 
 

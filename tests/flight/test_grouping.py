@@ -90,7 +90,9 @@ def test_a_log_on_the_route_of_two_flights_is_asked_about(tmp_path: Path) -> Non
     target = tmp_path / "flight.yaml"
     assert main(["ingest", str(tmp_path / "logs"), "--timezone", ZONE, "--draft", str(target)]) == 0
     texts = [target.read_text(), (tmp_path / "flight_2.yaml").read_text()]
-    (asked,) = (line for text in texts for line in text.splitlines() if "phone.csv" in line and "which flight?" in line)
+    (asked,) = (
+        line for text in texts for line in text.splitlines() if "phone.csv" in line and "the same flight?" in line
+    )
     assert "its positions are also on the track of the flight at 2025-03-02 1" in asked
 
 
@@ -104,7 +106,7 @@ def test_a_log_of_no_level_on_two_dateless_flights_names_the_other_by_its_log(tm
     for name, hour, quantity in (("a", 11, "RSRP"), ("b", 13, "RSRP"), ("c", 12, "Throughput")):
         _phone_without_date(tmp_path / f"{name}.csv", hour, quantity)
     (asked,) = (text for flight in flights(ingest(tmp_path, options=OPTIONS)) for text in flight.unsure.values())
-    assert asked == "its positions are also on the track of the flight of b.csv: which flight?"
+    assert asked == "its positions are also on the track of the flight of b.csv: the same flight?"
 
 
 def test_phones_that_know_no_date_are_a_flight_each(tmp_path: Path) -> None:
@@ -230,7 +232,7 @@ def test_a_log_may_lie_twelve_metres_beside_the_track(aside_m: float, agrees: bo
 @pytest.mark.parametrize(
     ("radio", "asked"),
     [
-        ("flight2_LW1_power_log.txt", "its name has flight 2, the name of the track has flight 1: which flight?"),
+        ("flight2_LW1_power_log.txt", "its name has flight 2, the name of the track has flight 1: the same flight?"),
         ("flight01_LW1_power_log.txt", ""),
         ("LW1_power_log.txt", ""),
     ],

@@ -83,7 +83,7 @@ def test_of_two_vehicles_the_levels_name_the_one_that_carried_the_radio(
     (tmp_path / "other.csv").write_text("x")
     both = [files[0], other] if first else [other, files[0]]
     _, remarks = draft([*both, files[1]], tmp_path, DraftOptions(time_origin=ORIGIN))
-    asked = [remark for remark in remarks if "which carried the radio?" in remark]
+    asked = [remark for remark in remarks if "which of them carried the radio?" in remark]
     assert len(asked) == (apart_m > 30.0)
     if asked:
         assert "pose.csv" in asked[0]

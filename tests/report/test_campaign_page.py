@@ -125,7 +125,7 @@ def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_me
     )
     assert "7.0 dB with each flight's own offset, 7.9 dB with the offset of the other flights" in means
     assert "Expect 7.9 dB on a new flight" in means
-    assert stands_out.startswith("No flight and no link stands out. Largest error: ")
+    assert stands_out.startswith("No flight or link stands out. Largest error: ")
     assert "Next: open the report of " in stands_out
     text = campaign_html.campaign_page(shown, [])
     assert text.index("significantly worse") < text.index("<main>")

@@ -162,7 +162,7 @@ def test_two_elevations_are_too_few_and_that_is_reported(tmp_path: Path) -> None
 
 def test_elevations_that_contradict_are_one_message(tmp_path: Path) -> None:
     heights = {(LATITUDE, LONGITUDE + 1e-8 * i): h for i, h in enumerate(("80", "240", "80"))}
-    with pytest.raises(UsageError, match="contradict: 80 and 240 m"):
+    with pytest.raises(UsageError, match="disagree: 80 and 240 m"):
         import_site([with_elevations(tmp_path / "c.geojson", heights)], towers=TOWERS)
 
 

@@ -61,7 +61,7 @@ def test_draws_spread_as_the_surface_says() -> None:
 
 def test_two_heights_at_one_place_are_refused() -> None:
     points = np.vstack([hills(10, 0.1), [[0, 0, 100, 0.1], [0.5, 0, 104, 0.1]]])
-    with pytest.raises(UsageError, match="ground_points 11 and 12 contradict: 100 and 104 m at one place"):
+    with pytest.raises(UsageError, match="ground_points 11 and 12 disagree: 100 and 104 m at one place"):
         surface_through(points, FRAME, REACH)
     points[-1, 3] = 5.0  # an error that admits it
     surface_through(points, FRAME, REACH)

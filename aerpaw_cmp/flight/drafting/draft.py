@@ -128,7 +128,7 @@ HEAD = """\
 LINK = (
     f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true,"
     " bandwidth_hz: 20e6}  # levels below the noise of this bandwidth are out of coverage;"
-    " are all values those of your experiment?\n"
+    " do all values fit your experiment?\n"
 )
 _DOWNLINK = (
     f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: false}}"
@@ -1065,7 +1065,7 @@ def _carrier(
     named = " and ".join(stream.name for stream, _ in tracks)
     apart = max(_apart_m(stream, flown[0]) for stream, _ in tracks[1:])
     fit = f", and the levels fit {best[0].name}" if sure else ""
-    return best, f"{named} flew at this time, {apart:.0f} m apart{fit}: which carried the radio?"
+    return best, f"{named} flew at this time, {apart:.0f} m apart{fit}: which of them carried the radio?"
 
 
 def _apart_m(first: Stream, second: Stream) -> float:

@@ -385,9 +385,9 @@ class _Finder:
             limit *= 2
         if limit > _MOST_CANDIDATES:
             raise CheckError(
-                f"a batch has {most} candidates of a path for one tower, more than PathSolver can hold",
+                f"a batch has {most} candidates of a path for one tower, more than PathSolver can store",
                 expected=f"at most {_MOST_CANDIDATES}",
-                cause="take fewer samples or a smaller batch, or engine 'image'",
+                cause="use fewer samples or a smaller batch, or engine 'image'",
             )
         if (limit, slots) == (self.limit, self.slots):
             return False
@@ -404,7 +404,7 @@ class _Finder:
         if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * self.limit:
             raise CheckError(
                 f"a tower has nearly {self.limit} paths in one batch, beyond which Sionna drops paths",
-                cause="take a smaller batch",
+                cause="use a smaller batch",
             )
         # sum over both polarisations at both ends
         gain = np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count]

@@ -283,10 +283,10 @@ def _way_out(head: bytes) -> str:
     # take the most frequent sign as the separator, because decimal commas are rarer
     sign = max(",;\t|", key="".join(lines).count)
     rows = [line.strip("# ").split(sign if any(sign in line for line in lines) else None) for line in lines]
-    # a header has as many fields as the row below it, and only the row contains numbers; titles have fewer fields
+    # a header has as many fields as the row below it, and only the row contains numbers; settings are above the header
     valued = [any(map(_NUMBER.match, row)) for row in rows]
     heads = [i for i in range(len(rows) - 1) if valued[i : i + 2] == [False, True] and len(rows[i]) == len(rows[i + 1])]
-    at = max(heads or range(len(rows)), key=lambda i: (len(rows[i]), lines[i][:1] != "#"))
+    at = max(heads[::-1] or range(len(rows)), key=lambda i: (len(rows[i]), lines[i][:1] != "#"))
     first, names = lines[at], [name.strip().strip('"') for name in rows[at]]
     table = (heads or sign in first) and not any(name[:1].isdigit() for name in names)
     if table and len(names) > 1 and not first.startswith(("{", "[", "<", "$")):

@@ -656,7 +656,7 @@ def cause_beyond_models(cause: Cause | None, comparison: FlightComparison | None
 
 
 def next_step(data: FlightData, result: FlightResult, comparison: FlightComparison | None) -> str | None:
-    """Return the next step: a wider offset search, the step for the likely cause, or a better model.
+    """Return the next step: a wider offset search, a calibration, the step for the likely cause, or a better model.
 
     Parameters
     ----------
@@ -667,9 +667,9 @@ def next_step(data: FlightData, result: FlightResult, comparison: FlightComparis
     Returns
     -------
     str or None
-        The next step as a clause, by default that of the comparison. None for a training flight.
+        The next step as a clause, by default that of the comparison.
     """
-    beyond = [panel for panel in result.rss if panel.score.at_edge]
+    beyond = [panel for panel in result.rss if panel.score.at_edge and not panel.further.trained_on]
     if beyond:
         # the offset is added to the measurement. Extend the range by 10 dB more, so that the new optimum is not at an
         # edge.
@@ -680,8 +680,11 @@ def next_step(data: FlightData, result: FlightResult, comparison: FlightComparis
             max(high, *(10 * math.ceil(m / 10) + 10 for m in missing)),
         )
         return f"`rss: {{span_db: [{ends[0]:.0f}, {ends[1]:.0f}]}}`"
-    if any(panel.further.trained_on for panel in result.series):
-        return None
+    if any(panel.further.trained_on for panel in result.rss or result.rank):
+        # only a calibration file asks for a receiver of ranks
+        learned = any(panel.further.trained_on for panel in result.rank)
+        words = "CALIBRATION` with `rank: true` and" if learned else "FLIGHT FLIGHT` with"
+        return f"`aerpaw-cmp calibrate {words} other flights, then `aerpaw-cmp report FLIGHT --with CALIBRATED`"
     if result.likely_cause is not None:
         return result.likely_cause.next_step or None
     if is_one_place(result.rss):

@@ -65,13 +65,13 @@ class CalibrationData(Made):
     settings_text: str = ""
 
 
-ONE_FLIGHT = "A single flight cannot be scored. Next: add a second flight."
+ONE_FLIGHT = "A single flight cannot be scored. Next: `aerpaw-cmp calibrate FLIGHT FLIGHT` with a second flight."
 
 # Sentence and next step, by the verdict of :func:`~aerpaw_cmp.compare.verdict.by_flight` on learned antennas.
 HELPS: dict[str, tuple[str, str]] = {
     "better": (
         "The learned antennas are significantly better ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
-        "`aerpaw-cmp report FLIGHT --with CALIBRATED`",
+        "`aerpaw-cmp report FLIGHT --with CALIBRATED` with another flight",
     ),
     "worse": (
         "The learned antennas are significantly worse ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
@@ -81,7 +81,10 @@ HELPS: dict[str, tuple[str, str]] = {
         "The difference of {effect:+.1f} dB is not significant (95 %: {low:+.1f} to {high:+.1f} dB).",
         "add flights with different headings",
     ),
-    "no interval": ("The difference is {effect:+.1f} dB; an interval requires three flights.", "add a third flight"),
+    "no interval": (
+        "The difference is {effect:+.1f} dB; an interval requires three flights.",
+        "`aerpaw-cmp calibrate FLIGHT FLIGHT FLIGHT` with a third flight",
+    ),
 }
 
 # Sentence and next step, by the verdict of :func:`~aerpaw_cmp.compare.verdict.antenna_or_place` on the UAV's frame.

@@ -276,7 +276,7 @@ FEW = 8
 CAUSES: dict[str, tuple[str, str]] = {
     "outlying error": (
         "Flight {where} stands out: its RMSE is {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) that of the others.",
-        "open the report of {where} and read its likely cause",
+        "`aerpaw-cmp report FLIGHT` with {where}",
     ),
     "outlying offset": (
         "Flight {where} stands out: its offset differs by {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB).",
@@ -288,7 +288,7 @@ CAUSES: dict[str, tuple[str, str]] = {
     ),
     "none": (
         "No flight or link stands out. Largest error: {flight}, {error:.1f} dB ({link}).",
-        "open the report of {flight}",
+        "`aerpaw-cmp report FLIGHT` with {flight}",
     ),
 }
 
@@ -404,7 +404,7 @@ def verdict(data: CampaignData) -> list[str]:
     if not (rows := data.scored_rows):
         learned = any(LEARNED_HERE in row.fitted for row in data.reference_rows)
         none = f"“{data.reference}” has no error to report: its antennas were learned from these flights. Next: "
-        return [f"{none}list another setting first, or learn the antennas from other flights."] if learned else []
+        return [f"{none}`aerpaw-cmp calibrate FLIGHT FLIGHT` holds out each flight in turn."] if learned else []
     scored = [(row.rmse_db, row.n) for row in rows]
     known = {name: [row.baselines.get(name, np.nan) for row in rows] for row in rows for name in row.baselines}
     errors = {name: pooled_db(each, [row.n for row in rows]) for name, each in known.items() if np.isfinite(each).all()}

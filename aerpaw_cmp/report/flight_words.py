@@ -499,9 +499,6 @@ class Headline:
     reference: str
 
 
-TO_SCORE = "To score it: `calibrate` on other flights, then `report --with`."
-
-
 def paragraph(data: ReportData) -> str:
     """Return the summary: error and best baseline, expected error on another flight, one cause, one next step.
 
@@ -511,8 +508,8 @@ def paragraph(data: ReportData) -> str:
     error = _level_sentence(data.verdict, panels) if panels else _rank_sentence(data.rank)
     advice = "" if data.next_step is None else f"Next: {data.next_step}."
     if learned := _training(data):
-        other = error if panels or not data.rss else _baseline_sentence(data.rss)
-        parts = [learned, other, expected_sentence(data.rss), advice or ("" if panels else TO_SCORE)]
+        other = error if panels else _baseline_sentence(data.rss)
+        parts = [learned, other, expected_sentence(data.rss), advice]
     elif error:
         none = _without_cause(data.verdict, panels) if panels else ""
         # the next step of such a flight is always a wider search range
@@ -552,8 +549,8 @@ def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) ->
 
 
 def _training(data: ReportData) -> str:
-    """Return the sentence of a training flight. Empty if nothing was learned from its logs."""
-    for panels, what in ((data.rss, "the antennas"), (data.rank, "the receiver")):
+    """Return the sentence of a training flight. Empty if nothing was learned from its levels (or its ranks alone)."""
+    for panels, what in ((data.rss, "the antennas"), ([] if data.rss else data.rank, "the receiver")):
         learned = [panel for panel in panels if panel.further.trained_on]
         if learned:
             names = [panel.name if isinstance(panel, RssResult) else panel.tower for panel in learned]

@@ -289,10 +289,16 @@ def test_a_loss_over_directions_is_no_cause_where_another_model_explains_as_much
     assert cause_beyond_models(cause, comparison) is cause
 
 
-@pytest.mark.parametrize("logs", [None, ("ab" * 32,)])
-def test_a_training_flight_has_no_step_against_a_cause_that_its_first_words_leave_out(logs: Any) -> None:
-    panel = SimpleNamespace(score=SimpleNamespace(at_edge=False), further=SimpleNamespace(trained_on=logs))
+@pytest.mark.parametrize(("rss", "rank", "step"), [
+    ("", "", "look there"), ("learned", "", "calibrate FLIGHT FLIGHT` with other"), ("", "learned", "look there"),
+    (None, "learned", "calibrate CALIBRATION` with `rank: true` and other"),
+    ("learned", "learned", "calibrate CALIBRATION` with `rank: true` and other"),
+])  # fmt: skip
+def test_the_step_of_a_training_flight_scores_it(rss: str | None, rank: str, step: str) -> None:
+    """It is not the step against a cause, which the summary leaves out, or against an offset that is not scored."""
+    panels = [[SimpleNamespace(score=SimpleNamespace(at_edge=bool(learned)), further=SimpleNamespace(trained_on=learned))]
+              for learned in (rss, rank)]  # fmt: skip
     cause = Cause(name="lock", sentence="", next_step="look there")
-    result: Any = SimpleNamespace(rss=[panel], series=[panel], likely_cause=cause, next_step=None)
+    result: Any = SimpleNamespace(rss=[] if rss is None else panels[0], rank=panels[1], likely_cause=cause)
     data: Any = None
-    assert next_step(data, result, None) == (None if logs else "look there")
+    assert step in (next_step(data, result, None) or "")

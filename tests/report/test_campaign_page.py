@@ -126,7 +126,7 @@ def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_me
     assert "7.0 dB with each flight's own offset, 7.9 dB with the offset of the other flights" in means
     assert "Expect 7.9 dB on a new flight" in means
     assert stands_out.startswith("No flight or link stands out. Largest error: ")
-    assert "Next: open the report of " in stands_out
+    assert "Next: `aerpaw-cmp report FLIGHT` with " in stands_out
     text = campaign_html.campaign_page(shown, [])
     assert text.index("significantly worse") < text.index("<main>")
     assert "<td>worse than free space; better than constant level</td>" in text
@@ -155,7 +155,7 @@ def test_a_campaign_of_training_flights_has_a_first_sentence(data):
     shown = dataclasses.replace(data, rss=rows)
     (said,) = campaign_words.verdict(shown)
     assert said.startswith(f"“{data.reference}” has no error to report")
-    assert "Next: " in said
+    assert "Next: `aerpaw-cmp calibrate FLIGHT FLIGHT` holds out each flight in turn." in said
     cautions = [text for text in campaign_words.warnings(shown) if "learned from this log" in text]
     assert len(cautions) == len({row.flight for row in rows if row.setting == data.reference})
     assert all("(LW1 USRP1, LW1 USRP2, " in text for text in cautions)

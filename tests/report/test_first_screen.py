@@ -46,9 +46,8 @@ def test_pooled_error_is_that_of_all_samples_together():
     rng = np.random.default_rng(2)
     long_error, short_error = rng.normal(0, 3, 400), rng.normal(0, 7, 100)
     parts = [np.sqrt((part**2).mean()) for part in (long_error, short_error)]
-    assert pooled_db(parts, [400, 100]) == pytest.approx(
-        np.sqrt((np.concatenate([long_error, short_error]) ** 2).mean())
-    )
+    together = np.sqrt((np.concatenate([long_error, short_error]) ** 2).mean())
+    assert pooled_db(parts, [400, 100]) == pytest.approx(together)
 
 
 def with_errors(data, rmse_db, baseline_db):
@@ -193,17 +192,12 @@ def every_outcome(data):
         yield dataclasses.replace(judged, next_step=step) if learned or not cause else judged
 
 
-@pytest.mark.parametrize(
-    ("floor", "words"),
-    [
-        ({}, "Expect 3.5 dB in directions that were not flown."),
-        ({"floor_rmse_db": 7.7}, "Expect 7.7 dB on another flight."),
-    ],
-)
-def test_the_expected_error_is_that_of_flights_of_one_kind(report_data, floor, words):
+def test_the_expected_error_is_that_of_flights_of_one_kind(report_data):
     """For a receiver with a floor, the expected error is that of all held-out flights."""
-    known = {"rmse_db": 3.5, "kind": "in directions that were not flown", **floor}
-    assert expected_sentence([with_numbers(panel, elsewhere=known) for panel in report_data.rss]) == words
+    kind = "in directions that were not flown"
+    for floor, words in (({}, f"3.5 dB {kind}"), ({"floor_rmse_db": 7.7}, "7.7 dB on another flight")):
+        panels = [with_numbers(p, elsewhere={"rmse_db": 3.5, "kind": kind, **floor}) for p in report_data.rss]
+        assert expected_sentence(panels) == f"Expect {words}."
 
 
 def test_no_first_paragraph_has_more_than_sixty_words_and_all_have_one_order(report_data):
@@ -230,6 +224,11 @@ def test_a_training_flight_explains_its_dashes(report_data):
     assert text.startswith("Training flight: the antennas of 3 channels were learned from this flight's own log")
     assert "the tables show “–” instead of an error. For comparison, " in text
     assert DIGEST[0][:12] in rss_verdict(panels[0])
+    ranks = tuple(with_numbers(p, trained_on=DIGEST) for p in report_data.rank)
+    assert paragraph(dataclasses.replace(report_data, rank=ranks)) == paragraph(report_data), "the level has an error"
+    alone = paragraph(dataclasses.replace(report_data, rss=(), rank=ranks, next_step=step))
+    assert alone.startswith("Training flight: the receiver of LW1 was learned from this flight's own log")
+    assert alone.endswith(f" instead of an error. Next: {step}.")
 
 
 @pytest.mark.parametrize(("offset_db", "unit", "said"), [
@@ -463,7 +462,5 @@ def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_
     assert "Brier" not in text
     assert cards[0].value == f"{expected[0]:.1f} dB"
     assert any(f"{panel.name} lost its lock in 30 % of the samples" in said for said in cautions(data))
-    assert (
-        "Brier score of detection forecast from the predicted level is 0.14 (learned on other flights), and 0.20"
-        in rss_verdict(panel)
-    )
+    said = "Brier score of detection forecast from the predicted level is 0.14 (learned on other flights), and 0.20"
+    assert said in rss_verdict(panel)

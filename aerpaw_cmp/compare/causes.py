@@ -154,7 +154,13 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         return _by_health(None, tables)
     # a gain over directions comes last, because it can look like many faults
     either = min(named, key=lambda e: (CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
-    cause = _named(_likeliest_first(either, best, odds), named[either], _lead(either, odds))
+    # one of two causes may be of the UAV: then it must be likely on all channels, not only on those that show the other
+    names = [
+        name
+        for name in _likeliest_first(either, best, odds)
+        if not _conditions(name).of_uav or all(name in _names(_best(table, {name})) for table in tables)
+    ]
+    cause = _named(names, named[either], _lead(either, odds))
     return _by_health(cause, tables) if _OF_HEALTH & either else cause
 
 
@@ -216,7 +222,7 @@ def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
             name="level",
             channels=(off.name,),
             estimate=off.difference_db,
-            next_step="check its cable, attenuator and gain",
+            next_step="check its receiver, cable, attenuator and gain",
             sentence=f"The level at {off.where} is {abs(off.difference_db):.0f} dB {side} than on held-out flights.",
         )
     return None
@@ -517,11 +523,14 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
     channels = tuple(model.evidence.name for model in alone)
     where = channels[0] if len(channels) == 1 else f"{len(channels)} channels"
     others = [shown[0][frozenset([other])].trials[0].sentence for other in names[1:]]
+    step = trial.next_step
+    if len(channels) > 1:  # the step names the clearest channel only
+        step = step.replace(f"for {channels[0]}", "for both" if len(channels) == 2 else "for these channels")
     return Cause(
         name=" or ".join(names), channels=channels, estimate=trial.estimate[0], ci95=trial.estimate[1:],
         sentence=f"Likely cause at {where}: {', or '.join([trial.sentence, *others])}; "
         f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
-        next_step=trial.next_step, rmse_db=rmse, rmse_with_db=rmse_with, gain=gain,
+        next_step=step, rmse_db=rmse, rmse_with_db=rmse_with, gain=gain,
     )  # fmt: skip
 
 
@@ -772,7 +781,9 @@ _JUMP_M, _FASTEST_MPS = 5.0, 25.0
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the log of another tower."""
     for name, level in e.other_towers_db.items():
-        sentence, step = f"the log comes from {name}", f"`node: {name}` in this `logs:` line"
+        sentence, step = f"the log comes from {name}", f"`node: {name}` in `logs:` for {e.name}"
+        if name in e.towers:  # a tower cannot have two logs of one channel, so the logs are swapped
+            step = f"swap {name} and {e.tower} in `logs:` for {e.name}"
         change_db, cost = level - e.predicted_db, math.log(len(e.other_towers_db))
         yield Trial(name="tower", cost=cost, sentence=sentence, next_step=step, change_db=change_db)
 
@@ -979,8 +990,8 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
         # levels that vary are noise. Their means over seconds vary less, so a margin above the median is enough.
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
-        sentence = f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: not detected"
-        step = f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in this `logs:` line"
+        sentence = f"{share:.0f} % of samples are at {Printed(level):.0f} {e.unit}: not detected"
+        step = f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in `logs:` for {e.name}"
         estimate = level, level, level
         yield Trial(name="no detection", clipped=e.least, estimate=estimate, sentence=sentence, next_step=step)
 
@@ -1045,7 +1056,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
         return None
     name, words, step = _LIMITS[side]
     sentence = words.format(level=f"{Printed(limit):.0f} {e.unit}")
-    next_step = step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}")
+    next_step = step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}", name=e.name)
     return Trial(name=name, sentence=sentence, next_step=next_step)
 
 
@@ -1072,7 +1083,7 @@ _OVER_FLOOR_DB = 3.0
 
 
 _LIMITS = {
-    1.0: ("floor", "the log has no level below {level}", "`floor_db: {typed}` in this `logs:` line"),
+    1.0: ("floor", "the log has no level below {level}", "`floor_db: {typed}` in `logs:` for {name}"),
     -1.0: ("saturation", "the log has no level above {level}", "lower the gain; use only lower levels"),
 }
 

@@ -60,6 +60,8 @@ class LevelEvidence:
         meaning in words.
     other_towers_db : mapping of str to (n,)
         Predicted level of each other tower of the site.
+    towers : set of str
+        Towers of the flight that have a channel with the same name.
     locked, serving : (n,), optional
         1 if in lock (or served by this cell), 0 if not, NaN if unknown. None if the log has no such column.
     clock : ClockResult, optional
@@ -103,6 +105,7 @@ class LevelEvidence:
     misread_db: Mapping[str, FloatArray] = field(default_factory=dict)
     scaled_db: Mapping[str, FloatArray] = field(default_factory=dict)
     other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    towers: frozenset[str] = frozenset()
     locked: FloatArray | None = None
     serving: FloatArray | None = None
     clock: ClockResult | None = None

@@ -281,6 +281,7 @@ def _evidence(
         ),
         scaled_db=changed(link.scaled_db(data) if scaled else {}, known_both_db),
         other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
+        towers=frozenset(other.tower for other in data.rss if other.channel == series.channel),
         locked=None if series.locked is None else series.locked[order],
         serving=None if series.serving is None else series.serving[order],
         clock=None if replayed.clock is None else replayed.clock.result,

@@ -114,7 +114,7 @@ def _planted() -> dict[str, LevelEvidence]:
 
 @pytest.mark.parametrize("name", ["telemetry", "decibels", "sign", *(name for name in TROUBLES if name != "clock")])
 def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
-    evidence = _planted()[name]
+    evidence = replace(_planted()[name], tower="LW1")
     cause = flight_cause([evidence])
     assert cause is not None
     assert cause.name == name
@@ -130,8 +130,12 @@ def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
         assert "00:02:01 UTC" in cause.sentence
     assert name != "lock" or "%" not in cause.sentence, "the caution has the share of the samples, not of the seconds"
     if name == "floor":  # followed, the advice ends: three decibels above it, and no floor of what was cut
-        assert cause.next_step == f"`floor_db: {cause.estimate + 3.0:.0f}` in this `logs:` line"
+        assert cause.next_step == f"`floor_db: {cause.estimate + 3.0:.0f}` in `logs:` for LW1 A"
         assert _named(replace(evidence, floored=True)) != "floor"
+    if name == "tower":  # `node: LW3` alone would be refused if LW3 already has a channel of this name
+        swapped = flight_cause([replace(evidence, towers=frozenset({"LW1", "LW3"}))])
+        steps = "`node: LW3` in `logs:` for LW1 A", "swap LW3 and LW1 in `logs:` for LW1 A"
+        assert (cause.next_step, swapped and swapped.next_step) == steps
 
 
 def test_a_signal_below_the_noise_overloads_no_receiver() -> None:
@@ -352,9 +356,8 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
     left = residual - design @ np.linalg.solve(design.T @ inverse @ design + ridge, design.T @ inverse @ residual)
     designs = [noise.Columns(part) for part in (design[:, :1], design[:, 1:]) if part.size]
     fit = noise.fit_under_noise(residual, designs, known, search=False)
-    assert fit.log_likelihood == pytest.approx(
-        known.log_prior - exact.fun + 0.5 * n * np.log(2.0 * np.pi), abs=tolerance
-    )
+    expected = known.log_prior - exact.fun + 0.5 * n * np.log(2.0 * np.pi)
+    assert fit.log_likelihood == pytest.approx(expected, abs=tolerance)
     np.testing.assert_allclose(fit.residual_db, left, atol=max(0.2 * tolerance, 1e-3))
     several = noise.log_likelihoods(np.column_stack([residual[::-1], residual]), designs, known)
     assert several[1] == fit.log_likelihood
@@ -375,10 +378,8 @@ def test_the_correlation_time_of_an_absent_part_of_the_noise_changes_no_digit(sh
 
 @pytest.mark.parametrize("likelier", ["first", "second"])
 def test_of_two_names_the_likelier_one_of_the_best_explanation_is_first(likelier: str) -> None:
-    both, odds = (
-        frozenset({"first", "second"}),
-        {frozenset(): 0.0, frozenset({"first"}): 4.0, frozenset({"second"}): 4.0},
-    )
+    both = frozenset({"first", "second"})
+    odds = {frozenset(): 0.0, frozenset({"first"}): 4.0, frozenset({"second"}): 4.0}
     ordered = causes._likeliest_first(both, both, odds | {frozenset({likelier}): 5.0})
     assert ordered[0] == likelier
     assert causes._likeliest_first(both, both - {likelier}, odds | {frozenset({likelier}): 5.0}) == ordered[::-1]
@@ -390,19 +391,16 @@ def test_a_free_form_pays_for_its_numbers_and_a_wide_search_for_its_width() -> N
     A value that is known to a tenth of its range costs a factor of ten.
     """
     generator = np.random.default_rng(5)
-    residual, design = (
-        generator.normal(size=300),
-        np.column_stack([np.full(300, 100.0), generator.normal(size=(300, 20))]),
-    )
+    residual = generator.normal(size=300)
+    design = np.column_stack([np.full(300, 100.0), generator.normal(size=(300, 20))])
     free, bound = (
         noise.fit_under_noise(residual, [noise.Columns(x)], noise.START, search=True) for x in (design, design[:, :1])
     )
     assert bound.log_likelihood - free.log_likelihood > 20.0
     value = np.linspace(-5.0, 5.0, 1001)
     peak = -0.5 * (value / 0.4) ** 2  # as wide as 0.4 times the root of 2 pi
-    assert causes._concentration(peak, np.gradient(value)) == pytest.approx(
-        np.log(10.0 / (0.4 * np.sqrt(2 * np.pi))), abs=0.01
-    )
+    expected = np.log(10.0 / (0.4 * np.sqrt(2 * np.pi)))
+    assert causes._concentration(peak, np.gradient(value)) == pytest.approx(expected, abs=0.01)
     assert causes._concentration(np.zeros(7), np.arange(1.0, 8.0)) == 0.0
 
 
@@ -569,6 +567,7 @@ def test_held_out_flights_decide_on_steps_and_levels(change: str, size_db: float
     assert (NONE if cause is None else cause.name) == name
     if cause is not None and name != "pattern":
         assert "held-out flights" in cause.sentence
+        assert "receiver" in cause.next_step
         assert abs(cause.estimate) == pytest.approx(size_db, abs=2.5)
     if name == "level":  # the offset of a flight with another error does not show that its gain differs
         other = [replace(e, measured_db=e.measured_db + 5.0 * np.sign(np.sin(e.time_s / 3.0))) for e in channels]
@@ -579,8 +578,17 @@ def test_a_heading_that_one_of_two_channels_shows_is_not_that_of_the_uav() -> No
     sound, other = _sound(), replace(_sound(4), name="LW1 B")
     turned, both = (replace(e, measured_db=e.measured_db + e.turned_db[90.0]) for e in (sound, other))
     for channels, name in (([turned, both], "heading"), ([turned, other], NONE)):
-        cause = flight_cause(channels)
-        assert (NONE if cause is None else cause.name) == name
+        assert _named(*channels) == name
+
+
+def test_one_of_two_names_that_the_other_channel_contradicts_is_left_out() -> None:
+    """Half the decibels on one channel look like a greater height, but the UAV has one height."""
+    sound, rough = _sound(), np.repeat(np.random.default_rng(8).normal(0.0, 0.1, 30), 10)
+    raised = {60.0: -0.5 * sound.predicted_db + rough}
+    halved = replace(sound, measured_db=0.5 * sound.measured_db, raised_db=raised)
+    sound = replace(_sound(4), name="LW1 B", raised_db=raised)
+    assert _named(halved) == "height or decibels"
+    assert _named(halved, sound) == "decibels"
 
 
 def test_heights_that_drift_are_named_with_their_drift() -> None:
@@ -663,9 +671,8 @@ def test_interference_at_one_power_is_no_ceiling(above_db: float) -> None:
     often = (sound.time_s % 60.0) < 20.0
     ceiling = np.minimum(sound.measured_db, top)
     interfered = np.where(often, top + above_db, sound.measured_db)
-    assert _named(replace(sound, measured_db=ceiling if above_db == 0.0 else interfered)) == (
-        "saturation" if above_db == 0.0 else NONE
-    )
+    measured_db, name = (ceiling, "saturation") if above_db == 0.0 else (interfered, NONE)
+    assert _named(replace(sound, measured_db=measured_db)) == name
 
 
 def test_a_gain_that_grows_is_no_antenna_pattern() -> None:

@@ -40,7 +40,6 @@ BASE: dict[str, Any] = {
     "rss": {"lag": "off"},
 }  # fmt: skip
 
-DIPOLE = {"antenna": {"model": "dipole"}}
 ARRAY = {
     "layout": "linear", "elements": 3, "positions_m": [[0, 0, 0]], "antenna.model": "dipole", "antenna.file": "x",
     "antenna.variable": "x", "antenna.elevation": "x", "slant_deg": 30.0, "yaw_deg": 30.0, "pitch_deg": 30.0,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +28,7 @@ from aerpaw_cmp.propagation.geometry import rotation_from_aircraft
 from aerpaw_cmp.report.flight_data import rank_warnings, rss_warnings, track_of
 from aerpaw_cmp.report.flight_words import instants
 from aerpaw_cmp.site.learned import Errors
-from tests.simulated import write_yaml
+from tests.simulated import planned, simulate, write_yaml
 from tests.tables import LW1, ORIGIN, POSITIONS, eastwards, rank_log, rss_log, write_csv
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
@@ -48,35 +49,21 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         (False, None, 0.4, False),
         (True, None, 0.4, None),  # nothing is asked after an error below 1 dB
     ):
-        late = SimpleNamespace(
-            name="LW1 A",
-            tower="LW1",
-            antenna="",
-            clock=SimpleNamespace(
-                shifted=shifted, in_words="0.40 s ahead", radio_minus_telemetry_s=0.4, ci95_s=(0.3, 0.5), verdict=""
-            ),
-        )
-        right = SimpleNamespace(
-            name="LW2 A", tower="LW2", antenna="", clock=SimpleNamespace(shifted=False, verdict="ok")
-        )
+        lag = {"in_words": "0.40 s ahead", "radio_minus_telemetry_s": 0.4, "ci95_s": (0.3, 0.5), "verdict": ""}
+        of = {
+            name: SimpleNamespace(name=f"{name} A", tower=name, antenna="", clock=SimpleNamespace(**clock))
+            for name, clock in (("LW1", {"shifted": shifted, **lag}), ("LW2", {"shifted": False, "verdict": "ok"}))
+        }
         named = None if other is None else Cause(name=other, sentence="", next_step="")
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
         monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _, fall_db=fall_db: fall_db)
-        monkeypatch.setattr(
-            likely_cause, "_evidence", lambda _, s, *__, of={"LW1": late, "LW2": right}, **___: of[s.tower]
-        )
-        data: Any = SimpleNamespace(
-            files=[], rss=[SimpleNamespace(tower=name) for name in ("LW1", "LW2")],
-            settings=SimpleNamespace(antennas={}, cautions=()),
-        )  # fmt: skip
+        monkeypatch.setattr(likely_cause, "_evidence", lambda _, s, *__, of=of, **___: of[s.tower])
+        settings = SimpleNamespace(antennas={}, cautions=())
+        data: Any = SimpleNamespace(files=[], rss=[SimpleNamespace(tower=name) for name in of], settings=settings)
         replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None)] * 2)
+        score = SimpleNamespace(rmse_db=0.9 if first is None else 2.0, n=9)
         results: Any = [
-            SimpleNamespace(
-                name=f"{name} A",
-                measured_db=np.arange(9.0) * i,
-                training=False,
-                score=SimpleNamespace(rmse_db=0.9 if first is None else 2.0, n=9),
-            )
+            SimpleNamespace(name=f"{name} A", measured_db=np.arange(9.0) * i, training=False, score=score)
             for i, name in enumerate(("LW1", "LW2"), 1)
         ]
         cause, _ = likely_cause.cause_of(data, replays, results)
@@ -527,17 +514,8 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
 
     Without lock, they are distributed about the level of other flights.
     """
-    lock = SimpleNamespace(
-        gain_db=-100.0,
-        per_db=0.1,
-        share=0.7,
-        locked_db=-50.0,
-        locked_per_db=0.8,
-        locked_sd_db=7.0,
-        lost_db=-27.0,
-        lost_per_db=0.5,
-        lost_sd_db=8.0,
-    )
+    learned = {"gain_db": -100.0, "per_db": 0.1, "share": 0.7, "locked_db": -50.0, "locked_per_db": 0.8}
+    lock = SimpleNamespace(**learned, locked_sd_db=7.0, lost_db=-27.0, lost_per_db=0.5, lost_sd_db=8.0)
     monkeypatch.setattr(compare_flight, "lock_elsewhere", lambda *_: lock)
     case = SimpleNamespace(
         series=SimpleNamespace(locked=np.array([1.0, 1.0, 0.0]), link=SimpleNamespace(transmit_power_dbm=40.0)),
@@ -550,9 +528,8 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     # path gains 10, 0 and -10 dB from -100; in lock it measured -43 and -51, 1 dB below what others did at these gains
     assert parts.locked_db == pytest.approx([3.0 - 1.0, 3.0 + 1.0, 3.0 + 3.0])
     assert parts.probability == pytest.approx(1.0 / (1.0 + np.exp([-0.9, 0.1, 1.1])))
-    assert parts.lost_db == pytest.approx(
-        [-27.0 + shift - 5.0 + level for shift, level in ((4.5, 50), (-0.5, 60), (-5.5, 70))]
-    )
+    lost_db = [-27.0 + shift - 5.0 + level for shift, level in ((4.5, 50), (-0.5, 60), (-5.5, 70))]
+    assert parts.lost_db == pytest.approx(lost_db)
     assert (parts.locked_sd_db, parts.lost_sd_db) == (7.0, 8.0)
     case.series.locked = None
     assert compare_flight._with_lock(case, score, stated) is stated
@@ -563,9 +540,8 @@ def test_a_mirrored_track_without_attitude_mirrors_its_course(monkeypatch: pytes
     """The nose follows the course, so north-east by east becomes north-east by north."""
     heading = np.array([56.25, 0.0, 200.0])
     rotation = rotation_from_aircraft(0.0 * heading, 0.0 * heading, heading)
-    poses = SimpleNamespace(
-        position_m=np.array([[1.0, 2.0, 40.0], [9.0, 2.0, 40.0], [9.0, 5.0, 40.0]]), rotation=rotation
-    )
+    position_m = np.array([[1.0, 2.0, 40.0], [9.0, 2.0, 40.0], [9.0, 5.0, 40.0]])
+    poses = SimpleNamespace(position_m=position_m, rotation=rotation)
     replayed: Any = SimpleNamespace(
         poses=poses, track=SimpleNamespace(attitude_known=np.zeros(3, dtype=np.bool_)),
         link=SimpleNamespace(uav_array=SimpleNamespace(patterns=())),
@@ -584,3 +560,25 @@ def test_a_mirrored_track_without_attitude_mirrors_its_course(monkeypatch: pytes
         np.testing.assert_allclose(at["rotation"], mirrored, atol=1e-12)
     else:
         assert at["rotation"] is None  # that of the replay
+
+
+@pytest.mark.parametrize("name", ["sign", "decibels"])
+def test_a_flight_logged_as_path_loss_or_with_half_the_decibels_is_named(tmp_path: Path, name: str) -> None:
+    corners = [
+        (20, 30, 0),
+        (20, 30, 40),
+        (300, 50, 40),
+        (300, -200, 40),
+        (500, -200, 60),
+        (500, 150, 60),
+        (100, 250, 50),
+    ]
+    corners += [(-200, 250, 40), (-200, -50, 40), (20, 30, 40)]
+    plan = {"fading_db": 1.0}
+    simulate(write_yaml(tmp_path / "f.yaml", planned("f", corners, {"LW1": {"A": 0.0}}, plan=plan)))
+    log, changed = tmp_path / "f" / "LW1_A.txt", (lambda level: 20.0 - level if name == "sign" else 0.5 * level)
+    log.write_text(re.sub(r"-[\d.]+$", lambda found: f"{changed(float(found[0])):.4f}", log.read_text(), flags=re.M))
+    draft = tmp_path / "draft.yaml"
+    assert main(["ingest", str(log.parent), "--timezone", "America/New_York", "--draft", str(draft), "--quiet"]) == 0
+    cause = run_flight(load_data(load_flight(draft), tmp_path), audit=False).result.likely_cause
+    assert (cause is not None and cause.name) == name

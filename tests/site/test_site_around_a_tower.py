@@ -115,7 +115,6 @@ def test_two_towers_of_one_name_are_refused(tmp_path: Path) -> None:
 
 
 TOWERS = (f"roof={LATITUDE},{LONGITUDE},25", f"mast={LATITUDE},{LONGITUDE + 4e-3},12")
-M_PER_DEG = 111_320 * 0.8304  # of longitude at 33.86 degrees south
 
 
 def with_elevations(path: Path, elevations: dict[tuple[float, float], str]) -> Path:

@@ -83,9 +83,8 @@ def tried(expect, path, part=False, reader=None, **options):
 
 def verdict(entry, folder):
     """Read a table as it is, then with the answer to the question of the reader, then as the reader proposes."""
-    path, expect = folder / entry["file"], entry.get("expect")
-    text = entry["text"].replace("\n", "\r\n" if entry.get("newline") == "crlf" else "\n")
-    path.write_bytes(text.encode(entry.get("encoding", "utf-8")))
+    path, expect, newline = folder / entry["file"], entry.get("expect"), "\r\n" if "newline" in entry else "\n"
+    path.write_text(entry["text"], encoding=entry.get("encoding", "utf-8"), newline=newline)
     found, words = tried(expect, path, **entry.get("options", {}))
     if found == "refused" and "ask" in entry:
         found, words = tried(expect, path, **entry["remedy"]) if "remedy" in entry else ("right", words)

@@ -70,10 +70,7 @@ def cases(name: str) -> dict[str, Right]:
 
 
 RIGHT, AUTOPILOTS, COUSINS = (cases(f"{name}.yaml") for name in ("logs", "autopilots", "cousins"))
-REFUSED = {
-    "35_levels_no_time.kml": "levels and positions without times",
-    "49_wifi_scan.txt": "a Wi-Fi scan of PawPrints",
-}
+REFUSED = {"35_levels_no_time.kml": "levels and positions without times", "49_wifi_scan.txt": "a Wi-Fi scan"}
 
 
 def test_every_case_has_its_right_value() -> None:

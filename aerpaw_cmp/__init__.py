@@ -1,4 +1,4 @@
-"""Ingest AERPAW field logs, replay the flight by ray tracing, compare the two.
+"""Read AERPAW field logs, replay the flight by ray tracing, and compare measured and replayed levels and ranks.
 
 The names below are stable (docs/api.md); everything else may change. Importing this package is fast, because each name
 is imported when it is first used.

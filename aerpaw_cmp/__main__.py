@@ -161,7 +161,7 @@ def main(arguments: list[str] | None = None) -> int:
     Parameters
     ----------
     arguments : list of str, optional
-        Without the program's name; those of this process by default.
+        Arguments without the program's name. By default, the arguments of this process are used.
 
     Returns
     -------

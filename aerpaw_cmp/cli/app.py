@@ -81,7 +81,7 @@ _OF_RUN = {
 
 
 def of_run(out: str, *names: str, metavar: str = "DIR") -> dict[str, Any]:
-    """Return the options that fill the :class:`RunOptions` of a command: ``--out``, then those with the given names."""
+    """Return the options that fill the :class:`RunOptions` of a command: ``--out`` and the named options."""
     return {"out": Annotated[Path | None, output(out, metavar)]} | {name: _OF_RUN[name] for name in names}
 
 

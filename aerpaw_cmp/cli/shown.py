@@ -173,7 +173,7 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
         lines = [""]
         for name, cell in zip(columns[1:], row[1:], strict=True):
             item = f"{name} {cell}"
-            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # 7 is the indent and the separator
+            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # indent and separator need 7
                 lines.append("")
             lines[-1] += f" | {item}" if lines[-1] else item
         show(row[0])

@@ -238,7 +238,7 @@ def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None)
     gain_db : (n,)
         Predicted level above free space [dB]. NaN is not scored.
     simple : Simple, optional
-        Baselines whose offsets were fitted outside each scored part, as that of ``gain_db`` was. By default, every
+        Baselines whose offsets were fitted outside each scored part, like the offset of ``gain_db``. By default, every
         baseline has one offset for the whole flight.
 
     Returns
@@ -383,7 +383,7 @@ _SPREAD_SAMPLES = 400
 
 
 def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score]:
-    """Yield scores with the offset of the scored flight and with that of the training flights, where both are known."""
+    """Yield scores with the offset of the scored flight, and of the training flights, if both offsets are known."""
     for o in unseen:
         if o.samples.antenna not in offsets:
             continue

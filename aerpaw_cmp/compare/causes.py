@@ -193,7 +193,7 @@ def _unpaid(models: Sequence[_Model]) -> float:
 
 
 def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
-    """Return the cause after comparing steps and offsets with those of held-out flights.
+    """Return the cause after comparing steps and offsets with steps and offsets of held-out flights.
 
     A fit within a flight cannot distinguish a step from slow fading. If the usual errors of all channels are known,
     they decide.
@@ -421,7 +421,7 @@ def _together_db(shown: Sequence[_Models]) -> float:
             columns += [] if trial.change_db is None else [trial.change_db]
             columns += [] if trial.columns is None else list(trial.columns.T)
         design, target = np.column_stack(columns), e.measured_db - e.predicted_db
-        # omit infinite levels: a candidate position of the tower may be that of the UAV
+        # omit infinite levels, because a candidate position of the tower may coincide with the UAV
         design = design[:, np.isfinite(design).all(axis=0)]
         residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
         squares.append((residual**2).sum() / max(len(target) - design.shape[1], 1))
@@ -467,8 +467,8 @@ def _models(e: LevelEvidence) -> _Models:
     def best_of(sets: Iterable[tuple[Trial, ...]], at: NoiseParameters) -> list[_Model]:
         """Return the likeliest model of each set of names, best first, with its own noise.
 
-        Trials without a name that change levels are kept apart from those that add a gain, because their order can
-        change with other noise.
+        Trials without a name that change levels are separate from trials that add a gain, because the order of both
+        kinds can change if the noise changes.
         """
         best: dict[tuple[frozenset[str], bool], _Model] = {}
         for trials in sets:
@@ -688,7 +688,7 @@ _BETWEEN = np.linspace(-0.8, 0.8, 9)
 def _tuned(
     e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Trial, words: Callable[[float], str]
 ) -> Trial:
-    """Return the trial with the likeliest value. Changes at values between the given ones are interpolated."""
+    """Return the trial with the likeliest value. Changes at values between the given values are interpolated."""
     # the value 0 means no change, which is an exact point of the interpolation
     values = sorted({0.0, *changes_db})
     likely = _profiled(e, {value: dataclasses.replace(trial, change_db=change) for value, change in changes_db.items()})
@@ -852,7 +852,7 @@ _PATTERN = {
 
 
 def _pattern(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a smooth gain over the directions of the UAV's antenna instead of the known one."""
+    """Yield a smooth gain over the directions of the UAV's antenna instead of the known gain."""
     azimuth, elevation = np.radians(e.uav_azimuth_deg), np.radians(e.uav_elevation_deg)
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
@@ -1078,7 +1078,7 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 
 _LEAST_FADING = 0.1
-# At this distance above the floor [dB], half of the power is that of the floor.
+# At this distance above the floor [dB], half of the power comes from the floor.
 _OVER_FLOOR_DB = 3.0
 
 
@@ -1093,7 +1093,7 @@ _LIMITS = {
 
 _SEARCHED_PHI = (0.6, 0.93)
 _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
-# Angle over which the edge of a shadow fades [deg]: that of a Fresnel zone some hundred metres away.
+# Angle over which the edge of a shadow fades [deg]: the angle of a Fresnel zone some hundred metres away.
 _EDGE_DEG = 4.0
 # Smallest loss behind an obstacle [dB]. A smaller loss in a sector is usually caused by an antenna.
 _LEAST_LOSS_DB = 6.0

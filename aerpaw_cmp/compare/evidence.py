@@ -152,7 +152,7 @@ def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
-    # rounded levels all occur often: the lowest one is a floor only if it occurs at least as often as the next one
+    # rounded levels all occur often: the lowest level is a floor only if it occurs at least as often as the next
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
     # count a run of equal levels as one measurement, because the log repeats levels
     usual_run = 1.0 + 2.0 * np.median(ages(np.arange(len(level)), level)[~at]) if not at.all() else 1.0
@@ -197,7 +197,7 @@ _AT_END, _SHARE_AT_END = 10, 0.01
 
 
 def _undetected(level_db: FloatArray) -> BoolArray | None:
-    """Return the samples (n,) without detection: those near and below the densest level, if links drop to it suddenly.
+    """Return samples (n,) without detection: near or below the most frequent level, if links drop to it suddenly.
 
     Return None if the level fades slowly into the densest level, as near a floor or in a hover.
     """

@@ -223,7 +223,7 @@ class GainModel:
     own_scales_db: tuple[tuple[str, float, float], ...] = ()
 
     def scales_db(self, *names: str) -> tuple[float, float]:
-        """Return the standard deviations of nuisance and noise [dB]: those of the first name with separate values."""
+        """Return the standard deviations of nuisance and noise [dB], from the first name that has separate values."""
         known = {name: (own, noise) for name, own, noise in self.own_scales_db}
         return next((known[name] for name in names if name in known), (self.own_sd_db, self.noise_sd_db))
 
@@ -802,7 +802,7 @@ class Spread:
     bin_s: float
 
     def total_db(self, gain_sd_db: FloatArray) -> FloatArray:
-        """Return the standard deviation (n,) of a sample about its prediction, including that of the gain [dB]."""
+        """Return the standard deviation (n,) of a sample about its prediction, including errors of the gain [dB]."""
         variance = self.own_sd_db**2 + self.noise_sd_db**2 + self.fading_sd_db**2
         return np.asarray(np.sqrt(gain_sd_db**2 + variance))
 

@@ -262,7 +262,7 @@ def step_of(channels: Sequence[Judged]) -> Step | None:
     """Return the common step of all channels of a flight, or None if there is none.
 
     A step must be larger than steps in healthy flights and likelier than a slower change. After it is subtracted, the
-    error must be like that of a healthy flight.
+    error must be as small as in a healthy flight.
     """
     series = [binned(c.time_s, c.error_db) for c in channels]
     least = _STEP_CHI2 + _FURTHER_CHI2 * max(len(channels) - 2, 0)
@@ -312,7 +312,7 @@ def _likeliest(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OddLevel:
-    """A channel whose level differs from that of held-out flights [dB], and text that names the channels."""
+    """A channel whose level differs from the level on held-out flights [dB], and text that names the channels."""
 
     name: str
     where: str

@@ -181,7 +181,7 @@ def compare_models(
         adjacent.
     candidates : sequence of CandidateModel
         Models, simplest first: lines, then more and more paths and losses, which is also the order of their cost. Of
-        two equal models, the earlier one is used.
+        two equal models, the earlier model is used.
     position_m : sequence of (n, 3)
         Position of each sample [m]; areas are held out (:func:`places_of`).
 

@@ -253,7 +253,7 @@ def _window_means(time: FloatArray, values: FloatArray, window_s: float) -> Floa
     first = np.searchsorted(time, time - 0.5 * window_s, side="left")
     last = np.searchsorted(time, time + 0.5 * window_s, side="right")
     # sum each window separately, because differences of a cumulative sum lose precision for weak levels after strong
-    # ones
+    # levels
     ends = np.column_stack([first, last]).ravel()
     return np.asarray(np.add.reduceat(np.append(values, 0.0), ends)[::2] / (last - first))
 

@@ -357,7 +357,7 @@ def _fit(
 
 
 def _whitened(features: FloatArray, seen: BoolArray, shadow: _Shadowing) -> tuple[FloatArray, FloatArray]:
-    """Return whitened features above the floor (m, k, terms + 1), and those below it, given these (m, j, terms + 1)."""
+    """Return whitened features above the floor (m, k, terms + 1), and below it given these (m, j, terms + 1)."""
     flat = features.reshape(len(features), -1)
     above = shadow.root @ flat[seen]
     below = flat[~seen] - shadow.across @ above

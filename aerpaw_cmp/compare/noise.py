@@ -123,7 +123,7 @@ def fit_under_noise(residual: FloatArray, designs: Sequence[Columns], at: NoiseP
     residual : ndarray, (n,)
         Errors of consecutive means [dB].
     designs : sequence of Columns
-        Effect of each coefficient.
+        Effect of each fitted coefficient on the residual.
     at : NoiseParameters
         Parameters of the noise, or the start of the search.
     search : bool

@@ -1,8 +1,8 @@
 """The constant offset between a measurement and a simulation, and its uncertainty.
 
 The offset is **added to the measurement**. Offsets on the grid are integers divided by ``1 / step``, so that rounding
-errors do not accumulate. Of two equally good offsets, the one nearer zero is used. An optimum at the edge of the search
-range is flagged, because it indicates an error and is not a result.
+errors do not accumulate. Of two equally good offsets, the smaller magnitude is used. An optimum at the edge of the
+search range is flagged, because it indicates an error and is not a result.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
 
 
 def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_DB) -> int:
-    """Return the index of the offset nearest to ``target_db``. If two are equally near, return the one nearer zero."""
+    """Return the index of the offset nearest to ``target_db``. Of equally near offsets, use the smaller magnitude."""
     # clip the target to the grid, because in float64 all offsets are equally far from 1e30
     distance = np.abs(grid_db - np.clip(target_db, grid_db[0], grid_db[-1]))
     near = np.flatnonzero(distance <= distance.min() + _TIE * step_db)
@@ -147,7 +147,7 @@ def grid_offset(
     Returns
     -------
     OffsetFit
-        The best offset, to be added to the measurement. Of two equally good offsets, it is the one nearer zero.
+        The best offset, to be added to the measurement. Of two equally good offsets, it is the smaller magnitude.
 
     Raises
     ------

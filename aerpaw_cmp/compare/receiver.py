@@ -515,7 +515,7 @@ def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
     """Return weights (ranks,) that maximise kappa: one weight below and one above the most frequent rank.
 
     Without weights, the most frequent rank would be decided too often, and kappa rewards rare ranks. The two weights
-    are searched on a grid. Of weights with equal kappa, those nearest to 1 are used.
+    are searched on a grid. Of weights with equal kappa, the weights nearest to 1 are used.
     """
     commonest = int(np.bincount(rank).argmax())
     # weights near 1 first, so that a weight farther away is used only if it is better

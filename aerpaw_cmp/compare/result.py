@@ -138,7 +138,7 @@ class RssFurther:
     flight. ``n_flagged`` counts samples by reason. ``compared_with`` contains, for each baseline and each other
     assumption, whether ray tracing is better or worse on the same samples. The keys of ``averaged`` are simulation and
     window. ``n_outliers`` counts samples far outside the distribution of the levels of the channel; only
-    ``rmse_without_outliers_db`` excludes these samples. The other counts are those of
+    ``rmse_without_outliers_db`` excludes these samples. The other counts are the counts of
     :class:`~aerpaw_cmp.compare.level.RssComparison`.
 
     Parameters

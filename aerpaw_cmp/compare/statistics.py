@@ -103,9 +103,10 @@ _TABLES = Path(__file__).with_name("memory_weights.json")
 # with heavy tails contain fewer large errors than the process.
 CALM = 1.8
 
-# Number of parts of a flight whose powers are compared, the multiple of the median power above which a part is loud,
-# and the smallest number of samples. In the simulations of ``benchmarks/coverage_of_intervals.py``, fewer than 1 % of
-# steady flights have two loud parts, and 4 % of flights with 100 samples of Student's t with four degrees of freedom.
+# Number of parts of a flight whose powers are compared, the multiple of the median power above which a part is loud
+# (has unusually large errors), and the smallest number of samples. In the simulations of
+# ``benchmarks/coverage_of_intervals.py``, fewer than 1 % of steady flights have two loud parts, and 4 % of flights with
+# 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
 # Smallest widening factor, with which the interval contains 80 % of the draws. Without this limit, the factor could
@@ -122,9 +123,9 @@ class CorrelationSet:
 
     ``whiten`` (m, terms, terms) makes the terms independent. ``log_det`` (m,) is the logarithm of its determinant. For
     known terms, ``slope`` (m, terms) and ``variance`` (m,) determine mean and variance of the mean of the sequence.
-    ``power`` (m,) is the power of all terms. For errors that are correlated over position, ``beyond`` (m,) is their
-    power in faster terms, and ``freedom`` (m,) the number of independent squares in that power. For errors over time,
-    these are 0 and infinity.
+    ``power`` (m,) is the total power of all terms. For errors that are correlated over position, ``beyond`` (m,) is
+    their power in faster terms, and ``freedom`` (m,) the number of independent squares in that power. For errors over
+    time, these are 0 and infinity.
     """
 
     whiten: FloatArray
@@ -156,7 +157,7 @@ class CorrelationSet:
 
 @cache
 def time_correlations(terms: int = TERMS) -> CorrelationSet:
-    """Return exponential correlations for each of :data:`WHITE_SHARES`, then smooth ones, at all :data:`RATES`."""
+    """Return exponential correlations for all :data:`WHITE_SHARES`, then smooth correlations, at all :data:`RATES`."""
     white = np.eye(terms + 1)
     covariances = [
         (1.0 - share) * 0.5 * rate * _exponential(rate, terms).real + share * white
@@ -360,7 +361,7 @@ class Channels:
     centred: bool
 
     def weighted(self, values: FloatArray, known: WeightedCorrelations, place_m: Track) -> WeightedCorrelations:
-        """Return the correlations weighted for a pooled sequence (n,), given those weighted as for a single channel.
+        """Return the correlations weighted for a pooled sequence (n,), given their weights for a single channel.
 
         The terms of the sequence are the sum of the terms of its channels. If channels are independent, the outer
         products of the terms of each channel add up to the covariance of the sum on average, even if the channels have
@@ -436,7 +437,7 @@ def _picked(slow: FloatArray, known: WeightedCorrelations) -> tuple[IntArray, Fl
 def _stretched(drawn: FloatArray, by: float) -> FloatArray:
     """Stretch draws about their median, separately on each side.
 
-    The new 2.5 % points are the old points whose odds are those of 2.5 % to the power ``by``.
+    The new 2.5 % points are the old points whose odds are the odds of 2.5 % raised to the power ``by``.
     """
     tail = 1.0 / (1.0 + 39.0**by)  # 39 to 1 are the odds of 2.5 %
     # interpolate directly, in half the time of np.quantile
@@ -509,8 +510,8 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
     Returns
     -------
     share, ratio : float
-        Share of the samples in the loud parts, and the mean square of these samples divided by that of all others. 0
-        and 1 if the sequence is steady. At least two parts must be loud by the innovations of a second-order
+        Share of the samples in the loud parts, and the mean square of these samples divided by the mean square of all
+        others. 0 and 1 if the sequence is steady. At least two parts must be loud by the innovations of a second-order
         autoregression, which are hardly correlated, and by their own mean square.
     """
     away = values - values.mean()
@@ -973,7 +974,7 @@ def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | 
 
     Channels with the same ``measured`` levels count once.
     """
-    # Holm: multiply the smallest p-value by the number of channels, the next one by one less, and so on
+    # Holm: multiply the smallest p-value by the number of channels, the next by this number minus one, and so on
     order = sorted(range(len(pairs)), key=lambda i: pairs[i].p_value)
     names = measured or range(len(pairs))
     out, tried = list(pairs), {names[i] for i in order if pairs[i].verdict != "no interval"}
@@ -1141,7 +1142,7 @@ class _Places:
         return cKDTree(self.position_m)
 
     def partners(self, other: _Places, radius_m: float, within_deg: float | None) -> tuple[IntArray, IntArray]:
-        """Return indices in both passes: samples, and the nearest samples of the other pass with a similar heading."""
+        """Return pairs of indices: samples of this pass, and the nearest of the other pass at a similar heading."""
         # only samples in the box of the other pass can pair, which excludes most flights of a campaign
         near = np.flatnonzero(
             ((self.position_m >= other.low - radius_m) & (self.position_m <= other.high + radius_m)).all(axis=1)

@@ -47,7 +47,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return channels with an offset and enough samples, without copies. If any has a signal, omit those without."""
+    """Return channels with an offset and enough samples, without copies. If any has a signal, omit all others."""
     some = [p for p in without_copies(panels) if not p.score.at_edge]
     enough = [p for p in some if p.score.n >= statistics.FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
@@ -197,7 +197,7 @@ def left_out_offsets(n: ArrayLike, mean_db: ArrayLike, *, span_db: tuple[float, 
 def error_at_offset(
     offset_db: ArrayLike, rmse_db: ArrayLike, own_offset_db: ArrayLike, mean_db: ArrayLike
 ) -> FloatArray:
-    """Compute the RMSE [dB] at another offset than that of the fit.
+    """Compute the RMSE [dB] at an offset other than the fitted offset.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
 
 
 def verdict_of(difference: MeanOfFlights) -> RankingVerdict:
-    """Return the verdict on whether a setting is significantly worse than the first one."""
+    """Return the verdict on whether a setting is significantly worse than the first setting."""
     if not np.isfinite(difference.low):
         return "no interval"
     return "worse" if difference.low > 0 else "not significant"
@@ -287,7 +287,7 @@ NONE = "none"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """A verdict, as in the first sentences of a page.
+    """A verdict, such as the first sentences of a page state.
 
     Parameters
     ----------
@@ -441,7 +441,7 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
     -------
     Verdict
         ``antenna`` if each wrong frame is significantly worse, ``place`` if one is significantly better, ``no
-        interval`` for too few flights, else ``not separable``. Effect and interval are those of the wrong frame with
+        interval`` for too few flights, else ``not separable``. Effect and interval belong to the wrong frame with
         the most similar error.
     """
     known = [item for item in against if math.isfinite(item.effect)]
@@ -766,7 +766,7 @@ def _mean(nights: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) -> NodeOffset:
-    """Find the steps of one node's offset, night by night, without using nights after the one that is tested.
+    """Find the steps of one node's offset, night by night, without using nights after the tested night.
 
     Parameters
     ----------

@@ -658,7 +658,7 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
 _AGREE_M = 12.0
 # A log is not on the track if the median distance of a few of its points exceeds this at every shift [m].
 _NEAR_M = 4.0 * _AGREE_M
-# The best origin is unique if every origin more than a minute away has a distance larger by this factor.
+# The best origin is unique if the tracks are farther apart by this factor at every origin more than a minute away.
 _UNIQUE = 1.8
 _POINTS = 240
 

@@ -219,8 +219,8 @@ _IN_NAME = re.compile(
     r"(?<!\d)(20\d\d)[-_]?([01]\d)[-_]?([0-3]\d)(?:[T_ -]([0-2]\d)[-_:]?([0-5]\d)(?:[-_:]?([0-5]\d))?)?(?!\d)"
 )
 
-# Largest difference of a log from a date in its name. The date may be local or UTC, and that of the start or of the
-# end.
+# Largest difference of a log from a date in its name. The date may be local or UTC, and may be the date of the start or
+# of the end.
 _OF_THE_DAY = timedelta(hours=36)
 
 # Largest difference of a log from a time in its name. The program that names the log starts before its radio.

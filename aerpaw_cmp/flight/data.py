@@ -425,7 +425,7 @@ def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
 
 
 def is_own_radio(stream: Stream) -> bool:
-    """Check whether a level is that of the autopilot's telemetry radio, which does not receive towers."""
+    """Check whether a level comes from the autopilot's telemetry radio, which does not receive towers."""
     return stream.kind == "rss" and _text(stream, "quantity") == "telemetry radio RSSI"
 
 
@@ -567,7 +567,7 @@ def _sort_log(found: _Found, settings: FlightFile, site: Site, files: Sequence[I
     found.telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
     heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
     for stream in (s for s in heard if log.node or not is_own_radio(s)):
-        # the sounder writes power and quality to separate files; those of one receiver have similar paths
+        # the sounder writes power and quality to separate files, which have similar paths for the same receiver
         alike = {id(f): len(os.path.commonprefix([f.path, file.path])) for f in files}  # noqa: RUF071
         others = sorted(files, key=lambda f: (f is not file, -alike[id(f)]))
         elsewhere = (candidate for source in others for candidate in source.result.streams)

@@ -331,7 +331,7 @@ def _places(waypoints: Sequence[Waypoint], frame: SiteFrame) -> list[tuple[float
 
 
 def plan_text(waypoints: Sequence[Waypoint], frame: SiteFrame, speed_mps: float) -> str:
-    """Return a QGroundControl plan for ArduPilot. Each waypoint is followed by the yaw until the next one.
+    """Return a QGroundControl plan for ArduPilot. Each waypoint is followed by the yaw until the next waypoint.
 
     Parameters
     ----------

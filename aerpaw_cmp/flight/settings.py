@@ -363,7 +363,7 @@ class SiteChoice(StrictModel):
     antenna_height_m : float, optional
         Antenna height of every tower [m], replacing the heights of the site.
     tower_ground : {"flat", "offsets", "surface", "dem"}, optional
-        Model of the ground at the towers and below the paths, replacing that of the site.
+        Model of the ground at the towers and below the paths, which replaces the model of the site.
     """
 
     file: str = "lake_wheeler"
@@ -805,7 +805,7 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
     Raises
     ------
     UsageError
-        If a key is unknown (the nearest one is named) or a value has the wrong kind.
+        If a key is unknown (the message names the nearest key) or a value has the wrong kind.
     """
     if not overrides:
         return settings

@@ -7,13 +7,13 @@ A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 - ``start``: half seconds since 1970, empty if the log has no wall clock.
 - ``digits``: one digit every half second for the change of a level or a rank. It is the mean over 1 s minus the mean
   over 10 s, in steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
-- ``runs``: the smallest hashes of short runs of changes between readings, in steps of half a decibel (a bottom-k
+- ``runs``: the smallest hashes of short runs of changes between values, in steps of half a decibel (a bottom-k
   sketch, Broder 1997), 8 hex digits each. Many remain after rounding to 0.1 dB. Another flight has different hashes.
 
 Two fingerprints belong to one log if they share runs, or if their clocks agree and their digits correlate at some lag.
-The digits of a log correlate with those of a part of it, and with those of a thinned, resampled, rounded or scaled
-copy. The digits of repeated flights on one route also correlate, because of the ripple of the ground reflection. Only
-the clock and the readings distinguish such flights.
+The digits of a log correlate with the digits of a part of it, and of a thinned, resampled, rounded or scaled copy. The
+digits of repeated flights on one route also correlate, because of the ripple of the ground reflection. Only the clock
+and the runs distinguish such flights.
 
 If one series of a flight is recognised, the whole flight is a training flight.
 """
@@ -43,7 +43,7 @@ from .settings import FlightFile
 _STEP_S, _MEAN_S, _TREND_S = 0.5, 1.0, 10.0
 _LONGEST_S = 4 * 3600.0  # only the beginning of longer logs is used
 
-# Digits for the size of a change. 7 means no change, and a dot means half a second without readings.
+# Digits for the size of a change. 7 means no change, and a dot means half a second without values.
 _DIGITS, _MIDDLE, _PER_SD, _GAP = "0123456789abcde", 7, 2.5, "."
 
 _BEGIN = "f"
@@ -75,7 +75,7 @@ _RUNS, _LEAST_SHARED = 128, 3
 # Multiplier of the hashes: 2^64 divided by the golden ratio, odd, so that it has an inverse.
 _ODD = 0x9E3779B97F4A7C15
 
-# Positive readings are linear powers if all are below 1, or if their range exceeds this ratio.
+# Positive levels are linear powers if all are below 1, or if the ratio of the largest to the smallest exceeds this.
 _POWER_RATIO = 1e3
 
 # Smallest standard deviation of the changes. With a smaller value, a fingerprint would describe only the route. Real
@@ -84,9 +84,9 @@ _LEAST_SD = 0.2
 
 
 def mark_of(time: AnyArray, readings: FloatArray) -> str:
-    """Return the fingerprint of the readings (n,) of a series at times (n,).
+    """Return the fingerprint of the values (n,) of a series at times (n,).
 
-    The fingerprint is empty for readings with too few changes and for periodic readings.
+    The fingerprint is empty for values with too few changes and for periodic values.
     """
     known = np.flatnonzero(np.isfinite(readings) & ~np.isnat(time))
     # use a stable sort, because otherwise the order of equal times, and with it the fingerprint, would vary
@@ -138,7 +138,7 @@ def _runs(values: FloatArray) -> str:
 
 
 def _hashes(values: FloatArray, step_db: float) -> AnyArray:
-    """Return the hash of each run of readings with enough changes: a rolling polynomial modulo 2^64."""
+    """Return the hash of each run of values with enough changes: a rolling polynomial modulo 2^64."""
     steps = np.rint(np.diff(values) / step_db).astype(np.int64).view(np.uint64)
     if len(steps) < _RUN:
         return np.zeros(0, dtype=np.uint64)
@@ -275,7 +275,7 @@ def is_training_data(data: FlightData, trained_on: Sequence[str], marks: Sequenc
 
 
 def series_mark(series: RssSeries | RankSeries) -> str:
-    """Return the fingerprint of the readings of a series."""
+    """Return the fingerprint of the levels or ranks of a series."""
     return mark_of(series.time, series.measured_db if isinstance(series, RssSeries) else series.rank)
 
 
@@ -329,7 +329,7 @@ def _same_numbers(pattern: MeasuredPattern, table: SpherePattern) -> bool:
 
 
 def common(logs: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
-    """Return those of ``logs`` that are training logs in any of ``learned``."""
+    """Return the logs that are training logs in any of ``learned``."""
     known = set(union(*learned))
     return tuple(digest for digest in logs if digest in known)
 

@@ -245,7 +245,7 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
 
 
 def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudit:
-    """Compare rotations of the track at telemetry times with those from the logged angles."""
+    """Compare rotations of the track at telemetry times with rotations computed from the logged angles."""
     mode = data.settings.rss_attitude
     if mode == "ignored" or data.track is None:
         turned_anyway = any(np.abs(r.poses.rotation - np.eye(3)).max(initial=0.0) > 0 for r in replays)

@@ -105,7 +105,7 @@ def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[s
     """Return gains learned without each pair of flights, by pair.
 
     P(lock) of one flight is predicted by a fit to all other flights. The levels of each of these other flights are
-    predicted from the flights other than the two.
+    predicted from all flights except these two.
     """
     out: dict[tuple[str, str], Learned] = {}
     for one, other in combinations(groups_of(flights_of(observed)), 2):

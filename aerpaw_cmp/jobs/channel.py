@@ -243,7 +243,7 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> A
 
 
 def _planned(data: FlightData, route: Path, step_s: float) -> Along:
-    """Return poses of level flight along a route or plan. The heading is that of the route, or else the course."""
+    """Return poses of level flight along a route or plan. The heading comes from the route, or else the course."""
     targets = find_targets(route, data.site, TargetOptions())
     if targets.kind == "grid":
         found = "a site, not a route" if route.exists() else "no such file"

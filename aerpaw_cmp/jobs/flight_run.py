@@ -86,7 +86,7 @@ class Model:
     media : bool
         True if attenuating woods are media instead of single trees.
     relief : Relief
-        Ground at the towers and below the paths, instead of that of the flight file.
+        Ground at the towers and below the paths, instead of the ground in the flight file.
     """
 
     antennas: Antennas = "isotropic"
@@ -136,7 +136,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightComparison:
-    """The scored models, in the order of ``scores.candidates``. The model None is that of the flight file.
+    """The scored models, in the order of ``scores.candidates``. The model None has the settings of the flight file.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ class FlightComparison:
 
     @property
     def recommended(self) -> Model | None:
-        """The recommended model. None if it is that of the flight file, or if no model is recommended."""
+        """The recommended model. None if it is the model of the flight file, or if no model is recommended."""
         chosen = self.scores.recommended
         return None if chosen is None else self.models[chosen]
 
@@ -667,7 +667,7 @@ def next_step(data: FlightData, result: FlightResult, comparison: FlightComparis
     Returns
     -------
     str or None
-        The next step as a clause, by default that of the comparison.
+        The next step as a clause, by default the next step of the comparison.
     """
     beyond = [panel for panel in result.rss if panel.score.at_edge and not panel.further.trained_on]
     if beyond:

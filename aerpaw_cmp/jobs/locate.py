@@ -108,7 +108,7 @@ def _antennas(
     An airframe that was learned from this log is not used.
     """
     file, level = log
-    # the antennas of an unknown node are those of link.rss.tower, not those of a tower of the site
+    # link.rss.tower describes the antennas of an unknown node, not a tower of the site
     known = settings.link.of(level.channel).build(["node"], logs_root or flight.parent)
     node, uav = (array.patterns[0] for array in (known.tower_arrays["node"], known.uav_array))
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))

@@ -242,7 +242,7 @@ def _model_fields(
 def site_of(
     where: Path | None, flights: Sequence[NamedFlight], known: Sequence[FlightData], named: str | None = None
 ) -> tuple[Site, str | Path]:
-    """Return the site of a prediction or plan: the named site, else WHERE if it is a site, else that of the flights.
+    """Return the site of a prediction or plan: the named site, WHERE if it is a site, or the site of the flights.
 
     Parameters
     ----------

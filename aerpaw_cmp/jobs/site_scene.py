@@ -54,7 +54,7 @@ class SceneOptions:
     origin : str, optional
         ``latitude,longitude[,ground height]`` of the scene's (0, 0, 0), or ``local``. Default: the origin of ``base``.
     base : str, optional
-        Site from which towers and settings are kept.
+        Site from which towers and settings are taken.
     towers : sequence of str
         ``name=east,north,height`` [m]: antenna above up = 0 of the scene.
     materials : sequence of str

@@ -111,7 +111,7 @@ class TargetOptions:
     spacing_m : float, optional
         Distance between the positions of a grid. Default: ``grid_spacing_m``. Not allowed for a route.
     heading_deg : float, optional
-        Heading at all points. Default: that of the route, else all headings with equal weights.
+        Heading at all points. Default: the heading of the route, else all headings with equal weights.
     site : str, optional
         The site, if neither flights nor points name it.
     carrier_hz, tx_power_dbm : float, optional

@@ -4,7 +4,7 @@ Logs packed by gzip, bzip2 or xz are unpacked piece by piece, up to a limit. A f
 parallel packers write them.
 
 Zip and tar archives are read as folders of logs: members are streams with a limit and are never written to disk. The
-name of a member is that of a file in a folder: ``dataset.zip/LW1/power_log.txt``.
+name of a member has the form of a file in a folder: ``dataset.zip/LW1/power_log.txt``.
 
 Each line of the log of ``aerpaw-cmp tap`` is a JSON object. The last key is the CRC-32 of the text before it.
 
@@ -156,7 +156,7 @@ class Member:
 
 
 def is_archive(head: bytes) -> bool:
-    """Check whether the first bytes of a file (gunzipped or not) are those of an archive."""
+    """Check whether a file (gunzipped or not) begins like an archive."""
     # the signature of POSIX tar is at byte 257 of the first header
     return head.startswith(_ZIP) or head[257:262] == _TAR
 

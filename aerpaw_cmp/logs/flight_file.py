@@ -114,7 +114,7 @@ def is_flight_file(path: Path) -> bool:
 
 
 def _unchanged(book: BinaryIO) -> bool | None:
-    """Check whether the SHA-256 at the end is that of the content. Return None if there is no SHA-256."""
+    """Check whether the SHA-256 at the end fits the content. Return None if there is no SHA-256."""
     size = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
     book.seek(max(size, 0))
     end = book.read()

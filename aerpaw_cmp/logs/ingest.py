@@ -377,7 +377,7 @@ def _member(
     path: Path, member: packed.Member, content: Mapping[str, packed.Member], options: _OptionsFor | None,
     chosen: Reader | None,
 ) -> IngestedFile:  # fmt: skip
-    """Read one file of an archive, and unpack it only if its first bytes are those of a log."""
+    """Read one file of an archive, and unpack it only if it begins like a log."""
     # read only the beginning, because data sets contain recordings of GiB next to their logs
     head = member.read(DEEP_BYTES)
     if chosen is None and member.size > DEEP_BYTES and packed.packed_form(head) is None and not packed.is_archive(head):

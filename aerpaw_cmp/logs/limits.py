@@ -1,7 +1,7 @@
 """The possible range of each quantity of the record model. For all readers, rows outside the range are flagged.
 
 A value outside its range becomes NaN. For a position, an attitude or a velocity, all three components become NaN. The
-row gets a flag, and a warning states the number of these rows and the first of them. Rows with a flag of
+row gets a flag, and a warning states the number of these rows and the first row. Rows with a flag of
 :data:`UNSCORED` stay in the records and are not compared.
 
 The ranges follow from physics and from the performance of small aircraft. They are wide, because they should find
@@ -41,7 +41,7 @@ _JITTER_M = 15.0
 # Largest share of rows that are jumps. If the share is larger, the rows are several tracks, or their times are wrong.
 _FEW_JUMPS_SHARE = 0.2
 
-# Largest gain of speed of an aircraft within a second [m/s^2].
+# Largest acceleration of an aircraft [m/s^2].
 _GAIN_MPS2 = 10.0
 
 # Number of moves on either side of a step from which the speed is estimated.

@@ -438,7 +438,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
 
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the starts of runs of times in a quarter of an hour, the distinct quarters, and that of each run."""
+    """Return the starts of runs of times within a quarter of an hour, the distinct quarters, and each run's quarter."""
     # look up the zone once per quarter of an hour
     bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
     starts = np.flatnonzero(np.diff(bucket, prepend=bucket[:1] - 1))

@@ -259,7 +259,7 @@ class InverseDistance(_Local):
     def _combine(self, targets: FloatArray, samples: FloatArray, values: FloatArray) -> FloatArray:
         far = np.linalg.norm(samples - targets[:, None], axis=-1)
         at = far < kriging.TIE_M
-        # use distances relative to that of the nearest sample, to prevent overflow
+        # use distances relative to the distance of the nearest sample, to prevent overflow
         ratio = far[:, :1] / np.where(at, 1.0, far)
         weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
         weight /= weight.sum(axis=1, keepdims=True)
@@ -495,6 +495,6 @@ def kriging_wins(scores: Mapping[str, Score]) -> int:
 def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:
     if np.isfinite(correlation.correlation[1:]).any():
         return variogram.fit_biexponential(correlation.distance_m, correlation.correlation)
-    # Kriging requires a curve, so use that of the paper, and report that it was not fitted to these data
+    # Kriging requires a curve, so use the curve of the paper, and report that it was not fitted to these data
     reason = "no two positions have varying rank vectors: the paper's curve is used"
     return replace(variogram.PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)

@@ -225,7 +225,7 @@ def class_scale(key: str, title: str, names: Sequence[str]) -> Scale:
     return Scale(
         key=key, title=title, labels=(*names[first:], "out of coverage"), lowest=first,
         edges=np.array(classes[1:]) - 0.5,
-        # the first colour is that of positions out of coverage
+        # the first colour is for positions out of coverage
         colours=(*(CLASS_COLOURS[1 + i % (len(CLASS_COLOURS) - 1)] for i in range(len(classes))), CLASS_COLOURS[0]),
     )  # fmt: skip
 

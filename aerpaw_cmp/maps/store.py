@@ -46,7 +46,7 @@ from .grid import Grid, MapResult, serving_tower, voronoi_borders
 # A building within this distance of a hull is used [m]. The distance is far larger than rounding errors.
 NEAR_M = 0.01
 
-# Largest level above free space [dB]: that of ten paths in phase, each as strong as the direct path.
+# Largest level above free space [dB]: the level of ten paths in phase, each as strong as the direct path.
 _IN_PHASE_DB = 20.0
 
 # Fields of a :class:`~aerpaw_cmp.maps.grid.MapResult` with a value per position.

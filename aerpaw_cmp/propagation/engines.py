@@ -212,7 +212,7 @@ _SEAL = b"AERPAWCP"
 
 
 class PathCache:
-    """Path sets as ``<sha256>.npz`` in one folder.
+    """A cache of path sets, stored as ``<sha256>.npz`` in one folder.
 
     Parameters
     ----------

@@ -503,7 +503,7 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
             power = float((np.abs(e_theta[row]) ** 2 + np.abs(e_phi[row]) ** 2).mean())
             score += power * _pole_vectors(e_theta, sign * e_phi, row, slope)[2]
         scores.append(score)
-    # without a clear difference the direction of AERPAW's files is used
+    # without a clear difference, use the direction of AERPAW's files
     return scores[0] > 1.05 * scores[1] + 1e-6
 
 

@@ -581,7 +581,7 @@ def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 
 def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Return disjoint shapes: join shapes of equal height and material, and cut lower shapes below higher ones."""
+    """Return disjoint shapes: join shapes of equal height and material, and cut lower shapes below higher shapes."""
     disjoint: list[_Shape] = []
     for group in _groups(shapes):
         disjoint += group if len(group) == 1 else _higher_first(group, actions)

@@ -194,7 +194,7 @@ class LearnedHealth(StrictModel):
     """Errors of held-out flights of one channel, for comparison with a later flight.
 
     ``rmse_db`` is the mean over flights of the RMSE of 1-s means, with its SD. The error of 4-s means has two parts.
-    ``slow_sd_db`` is correlated over a time and a length, and ``white_sd_db`` is not. The usual offset is that of
+    ``slow_sd_db`` is correlated over a time and a length, and ``white_sd_db`` is not. The usual offset is in
     :class:`LearnedLevel`.
 
     Parameters
@@ -907,7 +907,7 @@ def sphere_grid(step_deg: float = 5.0) -> tuple[FloatArray, FloatArray, FloatArr
 
 
 def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
-    """Return a grid (thetas, phis) [dB] whose mean power over the sphere is that of an isotropic antenna.
+    """Return a grid (thetas, phis) [dB] whose mean power over the sphere is equal to an isotropic antenna.
 
     The mean of a learned gain is not determined, because it cannot be separated from the offset.
     """

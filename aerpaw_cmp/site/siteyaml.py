@@ -811,7 +811,7 @@ def place_trees(
     forest : Forest
         The number of trees is ``trees_per_hectare`` times the free area.
     sizes : TreeSizes, optional
-        Sizes of the trees; those of the paper by default.
+        Sizes of the trees, by default as in the paper.
     seed : int
         The same seed and forest result in the same trees. Forests do not affect each other.
     keep_clear : shapely geometry, optional
@@ -824,8 +824,8 @@ def place_trees(
 
     Notes
     -----
-    Random positions are drawn in batches. If two positions are too close, the earlier one is used, as in random
-    sequential addition. Complete batches are decided at once.
+    Random positions are drawn in batches. If two positions are too close, only the earlier position is used, as in
+    random sequential addition. Complete batches are decided at once.
     """
     area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
     # the seed uses the name, not the order, so that an added forest does not move the trees of others

@@ -138,7 +138,7 @@ def of_readings(
 
 
 def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:
-    """Return a clause that names the angle in whole degrees, if only one of two is. Otherwise the text is empty."""
+    """Return a clause that names the angle in whole degrees if only one of two is, and otherwise an empty text."""
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     # a receiver writes decimals even at rest; an index or a count does not
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]

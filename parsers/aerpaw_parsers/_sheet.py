@@ -649,7 +649,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
             comments.append(i)  # units below the names, or the header of an appended file
             continue
         rows.append(_Row(i, len(fields), len(header.place), header.placed(words)))
-        # a line of descriptions may precede that of the units
+        # a line of descriptions may precede the line of units
         begun |= valued and len(fields) == len(header.place)
     kept = _whole_rows(rows, header.names, numbers[-1] if numbers else at)
     if separator.startswith(" "):  # an empty cell shifts the cells after it
@@ -723,7 +723,7 @@ class _Header:
     def __init__(self, names: list[str]) -> None:
         self.names = names
         self.place = list(range(len(names)))  # column of each field under the present header
-        self._unit = [""] * len(names)  # unit of each field that differs from that of the first header
+        self._unit = [""] * len(names)  # units that differ from the first header
         self._bare, self._repeated = [dictionary.without_unit(name)[0] for name in names], False
 
     def adds_units(self, texts: list[str]) -> bool:
@@ -821,7 +821,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     Parameters
     ----------
     column : int, optional
-        Column of the times; by default the one that the dictionary finds.
+        Column of the times; by default the column that the dictionary finds.
 
     Raises
     ------

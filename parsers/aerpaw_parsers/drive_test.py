@@ -61,7 +61,7 @@ def _quantities(names: list[str]) -> set[str]:
 
 
 def _has_time(names: list[str]) -> bool:
-    """Check whether a name is that of a time, a date, or GPS weeks."""
+    """Check whether a name means a time, a date, or GPS weeks."""
     known = _quantities(names)
     return bool(known & {"time", "date"} or {"gps_week", "gps_seconds"} <= known or _sheet.has_date_in_parts(names))
 
@@ -87,7 +87,7 @@ class _Cell:
     rat: str
     place: str
     columns: dict[str, int] = field(default_factory=dict)  # column by field of a reading
-    ports: list[int] = field(default_factory=list)  # levels of single ports, in addition to that of the cell
+    ports: list[int] = field(default_factory=list)  # levels of single ports, besides the cell's
     marks: list[int] = field(default_factory=list)  # identities besides the PCI
     quantity: str = "RSRP"  # quantity of the level
 

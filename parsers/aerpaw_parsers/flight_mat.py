@@ -2,8 +2,7 @@
 
 Dataset 12 has ``mpower1 mpower2`` (channels USRP1, USRP2), and AFAR's exp-288 files ``mpower mquality``. Both have ``mX
 mY mZ`` (longitude, latitude, height above take-off) and ``mRoll mPitch mYaw`` in degrees. Their two clocks are
-``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, which is **local wall clock stored as if it were
-UTC**.
+``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, which is **local time stored as if it were UTC**.
 
 The LTE flights have ``RSRP RSRP2 RSRQ RSSI`` and ``mX mY mZ``, with ``timestamp_for_csv`` (text, local) and
 ``timestamp_meas``, which **is UTC** and is used. No cell was decoded where ``succes`` is 0: ``RSRP2`` is then -60, and
@@ -42,7 +41,8 @@ _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
 _NAMES = {*_TELEMETRY, *_LEVELS, *_TEXTS, *_EPOCHS, "mSpeed"}
 # Names that occur only in files of flights.
 _SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
-# Raw positions, with which files of LTE flights begin; they identify the format, but only interpolated ones are read.
+# Raw positions, with which files of LTE flights begin; they identify the format, but only interpolated positions are
+# read.
 _GPS = re.compile(r"GPS[xyz]")
 _TEXT = re.compile(_text.TIME)
 

@@ -169,7 +169,7 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     Returns
     -------
     repeats : _Samples
-        The suppressed samples, with the line of the ``*`` and times between those of the neighbours.
+        The suppressed samples, with the line of the ``*`` and times between the times of the neighbours.
     used : int array
         0-based ``*`` lines that were expanded.
     bad : list of (line, reason)

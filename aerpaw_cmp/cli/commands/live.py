@@ -94,7 +94,7 @@ def tap(
 
 
 class StatusLine:
-    """Show the status of one or more modems on standard error. On a terminal, each line overwrites the last one."""
+    """Show the status of the modems on standard error. On a terminal, each line overwrites the previous line."""
 
     def __init__(self, enabled: bool) -> None:
         self._enabled, self._terminal = enabled, sys.stderr.isatty()

@@ -48,7 +48,7 @@ def predict(
     spacing: Annotated[float | None, Option(min=1.0, help="Spacing of a grid [m]  [default: 30]")] = None,
     heading: Annotated[
         float | None,
-        Option(help="Heading at all points [deg]  [default: that of the route; all headings equally if it has none]"),
+        Option(help="Heading at all points [deg]  [default: heading of the route, or all headings equally]"),
     ] = None,
     carrier_ghz: Annotated[
         float | None, Option(min=0.1, max=100.0, help="Carrier frequency, if no flight is given [GHz].")
@@ -169,7 +169,7 @@ def channel(
     link: Annotated[
         str | None, Option(help="rss, rank or a channel of the flight file  [default: its first channel, else rss]")
     ] = None,
-    tower: Annotated[list[str] | None, Option(help="Tower; repeatable  [default: those of the logs]")] = None,
+    tower: Annotated[list[str] | None, Option(help="Tower; repeatable  [default: the towers of the logs]")] = None,
     step: Annotated[float, Option(min=0.001, help="Time between poses [s].")] = 1.0,
     formats: Annotated[
         list[str] | None, Option("--format", help="netcdf, npz, deepmimo, csv, all; repeatable  [default: netcdf]")

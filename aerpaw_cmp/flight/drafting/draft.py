@@ -405,7 +405,7 @@ _SAMPLING_RATE = re.compile(r"(?:^|[^a-z0-9])fs_?([0-9]+(?:\.[0-9]+)?) ?MHz", re
 
 
 def _bandwidth_mhz(paths: Sequence[str]) -> float:
-    """Return the bandwidth of the receiver [MHz]: the sampling rate in file names, else that of the sounder.
+    """Return the bandwidth of the receiver [MHz]: the sampling rate in file names, else the bandwidth of the sounder.
 
     Examples
     --------
@@ -572,7 +572,7 @@ class _Context:
     flown : (Stream, Span), optional
         The telemetry that is used as the track, and its time span.
     which : str
-        Question about the vehicle, empty if only one flew.
+        Question about the vehicle, which is empty if only one vehicle flew.
     unsure : mapping of str to str
         Questions about files that may belong to another flight, by path.
     has_level : bool
@@ -874,7 +874,7 @@ def _refused(
         if s.kind != "telemetry"
     ]
     refused = {}
-    # of several ranks in a log, use the one with the most values
+    # of several ranks in a log, use the rank with the most values
     for stream in sorted(streams, key=_missing):
         span, key = context.span(stream), _key(stream, entry)
         if span is None:

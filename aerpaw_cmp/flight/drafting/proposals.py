@@ -56,8 +56,8 @@ from ..track import Track
 from ..training import among, flight_logs, logs_of, marks_of, series_mark
 
 # Smallest log odds of a tower, and of a listed position. Of 20 real flights at LW1 and thirds of them, 18 have more
-# than -0.5 and all have more than -3. For six rovers, the log odds of towers are -11 or less, and those of the listed
-# positions -3 or more.
+# than -0.5 and all have more than -3. For six rovers, the log odds of towers are -11 or less, and the log odds of the
+# listed positions -3 or more.
 _TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
 # Log odds that learned antennas must add. For thirds of LW1 flights, antennas from one or two flights add 8 to 57. At
@@ -1008,7 +1008,7 @@ def errors_elsewhere(
     return _expected(named.entry, named.antenna("tower", series.link.carrier_hz), *(flown or ()))
 
 
-# Kind of the expected error with the antenna of the UAV alone.
+# End of a sentence about the expected error if only the antenna of the UAV is learned.
 ALONE = "with the airframe alone"
 
 # Directions are new if the standard deviation of the gain exceeds that in learned directions by this factor.

@@ -257,7 +257,7 @@ def why_not(
         return "an end or an image lies behind a face: it has no reflection point"
     for step, face in enumerate(sequence):
         far = _outside_m(faces, int(face), points[0, step])
-        # stop at the first missed face, because later points follow from this one and would mislead
+        # stop at the first missed face, because later points follow from this point and would mislead
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])

@@ -5,7 +5,7 @@ every crown near the path. The chords add up to the path's depth in foliage, and
 parameter changes, rays need not be traced again. Foliage does not change the phase.
 
 Where crowns overlap, both chords are added. Trunks are used only for :class:`Opaque`, because the shadow of a trunk is
-centimetres wide, and that of a crown is metres wide.
+centimetres wide, and the Fresnel zone at a crown is metres wide.
 
 A forest can also be modelled as a medium. Its loss combines the components through, over and around the canopy.
 
@@ -568,7 +568,7 @@ class _Crossing:
 
 
 def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_Crossing]:
-    """Yield the segments between points (segments, 3) [m] that cross each stand of a site, except zero-length ones."""
+    """Yield segments between points (segments, 3) [m] that cross each stand of a site, if longer than zero."""
     stands = [forest for forest in site.forests if forest.height_m is not None]
     if not stands:
         return

@@ -30,7 +30,7 @@ def half_space(cosine: FloatArray, eta: ComplexArray) -> tuple[ComplexArray, Com
     -------
     te, tm, root : (...) complex
     """
-    # the imaginary part of the root has the sign of that of eta, so that the refracted wave decays
+    # root and eta have imaginary parts of the same sign, so the refracted wave decays
     root: ComplexArray = np.sqrt(eta - (1.0 - cosine * cosine))
     return (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root), root
 

@@ -186,7 +186,7 @@ def specular_points(
     ----------
     dem : Dem
     source_m, target_m : (pairs, 3)
-        Ends [m].
+        Both ends of each link [m].
     wavelength_m : float
 
     Returns

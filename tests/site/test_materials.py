@@ -46,7 +46,7 @@ def test_ground_is_a_half_space_and_walls_are_not() -> None:
 
 def test_bands_are_held() -> None:
     with pytest.raises(
-        UsageError, match=r"medium_dry_ground.* at 28 GHz; expected 1-10 GHz, or stated constants"
+        UsageError, match=r"medium_dry_ground.* at 28 GHz; expected 1-10 GHz, or in site.yaml"
     ) as caught:
         material("medium_dry_ground").relative_permittivity(28e9)
     proposed = material(str(caught.value.expected).split("'")[1])  # what the message proposes can be used

@@ -379,11 +379,13 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
             return f"'aerpaw-cmp ingest {typed(place)} --draft flight.yaml' writes one from its logs"
     if extra := re.match(r"Got unexpected extra argument\S* \((.+)\)", error.found):
         return f"the same command without {one_line(extra[1])}"
-    settings_file = next((word for word in arguments if word.endswith(_SETTINGS)), None)
+    settings_files = [word for word in arguments if word.endswith(_SETTINGS)]
     # a log without a time zone is not wrong: the key must be added to the settings
     in_file = place is None or "timezone:" in (error.expected or "")
-    if in_file and settings_file and words[:1] in _OF_SETTINGS and "--" not in error.found:
-        return f"fix {one_line(Path(settings_file).name)} and run the same command"
+    if in_file and settings_files and words[:1] in _OF_SETTINGS and "--" not in error.found:
+        # the message names the flights: of several files, the first is not necessarily wrong
+        wrong = one_line(Path(settings_files[0]).name) if len(settings_files) == 1 else "the flight files"
+        return f"fix {wrong} and run the same command"
     if words[:1] == ["tap"] and isinstance(error, InputError):
         return "'aerpaw-cmp doctor' lists the serial ports"
     if re.match("Missing|No such option", error.found):

@@ -507,10 +507,11 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
     if not observed:
         raise InputError("none of the flights has RSS at known poses", expected="RSS logs with telemetry")
     for antenna, per_flight in carriers.items():
-        low, high = min(per_flight.values()), max(per_flight.values())
-        if high > 1.02 * low:
+        low, high = (of(per_flight, key=per_flight.__getitem__) for of in (min, max))
+        if per_flight[high] > 1.02 * per_flight[low]:
+            at = " and ".join(f"{per_flight[name] / 1e9:g} GHz ({name})" for name in (low, high))
             raise UsageError(
-                f"{antenna} was received at {low / 1e9:g} and {high / 1e9:g} GHz",
+                f"{antenna} was received at {at}",
                 expected="one frequency per tower and channel, because antenna gain depends on frequency",
                 cause="flights of different experiments, or a wrong link.rss.carrier_hz",
             )

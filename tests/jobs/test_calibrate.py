@@ -161,7 +161,10 @@ def test_bad_input_is_one_message(folder: Path, capsys: pytest.CaptureFixture[st
     high = settings("second", {"model": "iso"})
     high["link"]["rss"]["carrier_hz"] = 3.7e9
     write_yaml(folder / "high.yaml", high)
-    assert "3.3 and 3.7 GHz" in refusal(folder, capsys, base | {"flights": ["first.yaml", "high.yaml"]})
+    carriers = "at 3.3 GHz (first) and 3.7 GHz (second); "
+    assert carriers in refusal(folder, capsys, base | {"flights": ["first.yaml", "high.yaml"]})
+    assert main(["calibrate", *(str(folder / f"{name}.yaml") for name in ("first", "high"))]) == 2
+    assert "Next: fix the flight files and run the same command" in capsys.readouterr().err
     assert "gone.yaml" in refusal(folder, capsys, base | {"flights": ["first.yaml", "gone.yaml"]}, 3)
 
 

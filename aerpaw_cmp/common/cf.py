@@ -139,7 +139,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
             if dim not in book.dimensions:
                 book.createDimension(dim, None if dim in grows else size)
         encoding: dict[str, Any] = (
-            # shuffling sorts the bytes of numbers by significance, which single bytes do not have
+            # shuffling groups the bytes of numbers by significance, which has no effect on single bytes
             {"zlib": True, "complevel": 4, "shuffle": values.dtype.itemsize > 1} if values.ndim else {}
         )
         attributes = dict(variable.attrs)

@@ -325,7 +325,7 @@ def flight_left_out(
 ) -> tuple[Score, ...]:
     """Score the prediction of each flight from other flights (:func:`groups_of`).
 
-    ``without`` receives the gains that were learned without each flight.
+    ``without`` receives the gains that were learned with each flight left out.
     """
     scores: list[Score | None] = []
     for group in groups_of(flights_of(observed)):
@@ -431,7 +431,7 @@ def parts_left_out(
         Samples of all flights.
     recipe : Recipe
     without : mapping of str to Learned
-        Gains learned without each flight. Their strengths are used again.
+        Gains learned with each flight left out. Their strengths are used again.
     parts : callable
         :func:`altitude_parts`, :func:`heading_parts` or :func:`sector_parts`.
 

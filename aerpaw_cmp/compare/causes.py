@@ -877,7 +877,7 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield levels with half or twice the decibels (an amplitude was read as a power, or vice versa), or minus them.
+    """Yield levels with half or twice the decibels (amplitude read as power, or vice versa), or the opposite sign.
 
     The interval of the slope must support the factor, and a path-loss exponent and a gain over elevation, which change
     levels in the same way, must be much less likely than the factor.

@@ -754,7 +754,7 @@ USUAL_OFFSET_DB = 1.5
 
 
 def offset_sd_db(squares_db2: float, count: int, usual_db: float = USUAL_OFFSET_DB) -> float:
-    """Return the SD of a normal distribution with the 90 % band of the offset of a new flight about the true mean [dB].
+    """Return the SD of a normal distribution that has the 90 % band of the offset of a new flight [dB].
 
     ``squares_db2`` is the sum of squared differences of the offsets of flights from their mean, with ``count`` degrees
     of freedom. The SD between flights is integrated over its posterior distribution, because few flights hardly

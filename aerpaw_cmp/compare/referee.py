@@ -15,7 +15,7 @@ from .statistics import correlation
 # Averaging window of ``rmse_1s_db`` [s].
 WINDOW_S = 1.0
 
-# Name, in the cards, of the model of the scored report.
+# Name in the cards for the model of the report with which predictions are compared.
 OURS = "ray tracing (this report)"
 
 # Numbers of a card that are averaged over channels.

@@ -602,7 +602,7 @@ def _score_all(
     recipe : Recipe
     stages : Stages
     fits : dict of str to Learned
-        Receives the gains learned without each flight.
+        Receives the gains that were learned with each flight left out.
 
     Returns
     -------

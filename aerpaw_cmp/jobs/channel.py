@@ -145,7 +145,7 @@ def _moving(data: FlightData, chosen: ChannelOptions, towers: Sequence[str], rem
     """Return the poses of the track or route, and the velocities of both ends if they are known."""
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
     # a speed over less than one second is mostly noise of the positions
-    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # a long step is not a gap
+    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # a step is not a gap
     velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
     if not np.isfinite(velocity).any():
         remarks.append("No Doppler shift: no point has a neighbour in time, so the velocity of the UAV is unknown.")

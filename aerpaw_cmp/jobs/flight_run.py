@@ -116,7 +116,7 @@ class Model:
         return _FREE_SPACE if not parts else " + ".join(parts)
 
     def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
-        """Return the keys of flight.yaml for this model. ``max_depth`` is that of the flight file."""
+        """Return the keys of flight.yaml for this model. ``max_depth`` is the value in the flight file."""
         depth = 0 if self.ground == "none" else max(max_depth, 1) if self.buildings else 1
         rt: dict[str, Any] = {
             "max_depth": depth,
@@ -508,7 +508,7 @@ def recommended_changes(
 
 
 def _isotropic(content: Mapping[str, Any], path: KeyPath) -> dict[KeyPath, Any]:
-    """Return the changes to isotropic antennas below some keys of a link."""
+    """Return the changed keys with which all antennas below a key of a link are isotropic."""
     iso, changes = {"model": "iso"}, dict[KeyPath, Any]()
     for key, value in content.items():
         if key in ("antenna", "antennas"):

@@ -73,8 +73,8 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     cause = flight_cause(evidence)
     late = _late_clock(evidence)
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
-    # prefer a wrong clock to an antenna pattern, because the clock test allows for gains over directions. It does not
-    # allow for obstacles.
+    # name a wrong clock rather than an antenna pattern, because the clock test allows for gains over directions. It
+    # does not allow for obstacles.
     if late is not None and (cause is None or CATCH_ALL in cause.name.split(" or ")):
         return late, None
     # errors that depend on direction are expected if a named antenna could not be used; a caution contains the reason

@@ -184,7 +184,7 @@ class Feed:
                 self._bump()
 
     def after(self, cursor: str, wait_s: float = 0.0) -> tuple[dict[str, Any] | None, str]:
-        """Return everything newer than the cursor, and the next cursor. None if nothing new came within ``wait_s``.
+        """Return everything newer than the cursor, and the next cursor. None if nothing new arrives within ``wait_s``.
 
         A cursor of another session, or an invalid cursor, starts from the beginning.
         """

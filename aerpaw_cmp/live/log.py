@@ -93,7 +93,7 @@ class TapLog:
     Parameters
     ----------
     folder : Path
-        Folder of the segments. Created if missing.
+        Folder of the segments, which is created if it does not exist.
     header : callable
         Returns the header record of each segment.
     settings : LogSettings

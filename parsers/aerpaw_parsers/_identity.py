@@ -113,7 +113,7 @@ def _with_level(sheet: _sheet.Sheet) -> BoolArray:
 
 
 def dividing_columns(texts: Mapping[int, list[str]], counts: BoolArray, base: Sequence[str] = ()) -> list[int]:
-    """Return the columns, in order, that divide the rows further than the columns before them do.
+    """Return, in order, the columns that divide the rows further than the columns before them.
 
     Parameters
     ----------

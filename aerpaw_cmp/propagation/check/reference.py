@@ -319,7 +319,7 @@ class Blocks:
         self._shapes: dict[float, list[Polygon]] = {}
 
     def cut(self, a: Vector, b: Vector, grow_m: float, spared: tuple[int, ...] = ()) -> bool:
-        """Check whether a segment crosses a building. Those in ``spared``, on which it ends, are shrunk a little.
+        """Check whether a segment crosses a building. Buildings in ``spared``, on which it ends, are made smaller.
 
         Parameters
         ----------

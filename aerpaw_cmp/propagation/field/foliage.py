@@ -308,7 +308,7 @@ class CrownIndex:
         total = np.zeros(len(start_m))
         if not len(self._bodies) or not len(start_m):
             return total
-        # do not look up parts above all trees, which are most of a flight
+        # skip parts above all trees, because most of a flight is above them
         low, high = self._bodies[:, 2].min(), self._bodies[:, 3].max()
         first, last = slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
         along = np.hypot(end_m[:, 0] - start_m[:, 0], end_m[:, 1] - start_m[:, 1])

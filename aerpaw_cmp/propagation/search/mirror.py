@@ -54,7 +54,7 @@ _AROUND = np.column_stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros(16)])
 
 
 class Occlusion:
-    """A test whether segments are cut by the solids of a scene.
+    """A test of whether the solids of a scene cut segments.
 
     Parameters
     ----------

@@ -46,9 +46,9 @@ def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.sionna
 def test_the_notebook_with_sionna_runs(sionna: object) -> None:
-    """Trace every fourth pose. The cells run in another process, because scenes would stay in memory."""
+    """Trace every twelfth pose. The cells run in another process, because scenes would stay in memory."""
     source = "\n".join(["from tests.test_examples import run_command", *map(source_of, cells(SIONNA))])
-    thinned = source.replace("track = flight.track\n", "track = flight.track[::4]\n")
+    thinned = source.replace("track = flight.track\n", "track = flight.track[::12]\n")
     assert thinned != source
     check = "assert len(card['levels']) == 5 and gain.shape[1] == 5 and (gain > 0).mean() > 0.95"
     lines = [sys.executable, "-c", f"{thinned}\n{check}"]

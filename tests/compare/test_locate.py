@@ -123,7 +123,7 @@ def _flights(count: int, floor_db: float, bins: int = 75) -> Iterator[tuple[Leve
 @pytest.mark.parametrize(("floor_db", "count"), [(-np.inf, 8), (-62.0, 4)])
 def test_the_region_holds_the_node_nine_times_of_ten(floor_db: float, count: int) -> None:
     inside = 0
-    for track, truth in _flights(count, floor_db, bins=40):
+    for track, truth in _flights(count, floor_db, bins=28):
         estimate = locate(track)
         away = np.hypot(*(estimate.place_m[:2] - truth))
         inside += away <= estimate.radius90_m

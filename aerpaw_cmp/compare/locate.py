@@ -237,7 +237,7 @@ def level_track(
     time, place, level = time[finite], place[finite], np.maximum(level[finite], floor_db)
     if not len(time):
         return LevelTrack(time, place, level, floor_db)
-    # slightly longer: otherwise the last sample would be alone in a bin
+    # slightly longer, because otherwise the last sample would be alone in a bin
     window = max(WINDOW_S, float(np.ptp(time)) / _MOST_BINS * 1.001)
     groups = np.unique(((time - time.min()) // window).astype(np.int64), return_inverse=True)[1]
     order = np.argsort(groups, kind="stable")

@@ -1057,7 +1057,7 @@ def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pass:
-    """One flight on one link.
+    """One pass: a flight on one link.
 
     Parameters
     ----------

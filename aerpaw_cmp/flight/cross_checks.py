@@ -54,7 +54,7 @@ class Flight:
 
     @property
     def complete(self) -> bool:
-        """True if the flight has measurements, and positions to compare them at."""
+        """True if the flight has measurements and also positions, so that they can be compared."""
         measured = self.measured
         tracked = any(_tracks(file) for file in self.files)
         return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))

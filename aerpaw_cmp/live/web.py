@@ -115,7 +115,7 @@ class Address:
 
 
 class WebServer(ThreadingHTTPServer):
-    """A server of the page of one feed, as a context. Browsers with the token have a thread each.
+    """A server for the page of a feed, used as a context. Browsers with the token have a thread each.
 
     All connections wait in one loop until their requests are complete, for a limited time. The loop refuses requests
     without the token, so they do not need threads. If too many connections wait, connections of the most frequent

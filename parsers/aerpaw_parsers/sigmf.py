@@ -41,7 +41,7 @@ _PLACE = (("latitude_deg", ("mY", "y", "latitude", "lat")), ("longitude_deg", ("
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether a file is JSON with SigMF's three parts, of which the global one usually comes first."""
+    """Check whether a file is JSON with SigMF's three parts. The global part usually comes first."""
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     return text[:1] == b"{" and b'"core:datatype"' in head and (b'"captures"' in head or b'"global"' in head)
 

@@ -172,7 +172,7 @@ def test_fit_is_at_least_as_good_as_curve_fit_from_the_truth():
     ("curve", "reason"),
     [
         (lambda d: np.exp(-d / 100), "no amplitude|same rate"),
-        (lambda d: 0.4 + 0 * d, "does not show"),
+        (lambda d: 0.4 + 0 * d, "is not visible"),
         (lambda d: np.where(d == 0, 1.0, 0.7 * np.exp(-d / 400)), "ends before the first distance"),
         (lambda d: np.exp(-d / 100) * np.cos(d / 80), "as well"),
     ],

@@ -45,11 +45,12 @@ from aerpaw_cmp.__main__ import main as command
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import wrap_degrees
 from aerpaw_cmp.compare.result import FlightResult
-from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.gains import load_with_learned
-from aerpaw_cmp.flight.replay import replay_flight
+from aerpaw_cmp.flight.replay import FlightReplay, replay_flight
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs import compare_flight as compare
+from aerpaw_cmp.jobs.flight_run import flight_comparison
 from aerpaw_cmp.jobs.likely_cause import cause_of
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -287,12 +288,16 @@ class Flight:
     table: Table
     real: bool
 
-    def result(self, table: Table) -> FlightResult:
-        """Comparison of the flight with another table as its log."""
+    def replayed(self, table: Table) -> tuple[FlightData, FlightReplay]:
+        """Return the flight with another table as its log, and its replay."""
         settings = load_with_learned(self.folder / "flight.yaml")
         savemat(self.folder / settings.logs[0].path, table)
         data = load_data(settings, self.folder)
-        return compare.compare_flight(data, replay_flight(data))
+        return data, replay_flight(data)
+
+    def result(self, table: Table) -> FlightResult:
+        """Comparison of the flight with another table as its log."""
+        return compare.compare_flight(*self.replayed(table))
 
 
 def error_db(result: FlightResult) -> float:
@@ -362,17 +367,29 @@ def named(result: FlightResult) -> str:
 
 
 def healthy(flights: list[Flight]) -> None:
-    """Print the causes of whole flights, thirds and sixths without a fault."""
+    """Print the causes of whole flights, thirds and sixths without a fault, and what their recommendations cost."""
     accused = parts = 0
+    costs_db = list[float]()
     for flight in flights:
+        complete = None
         for of in (1, 3, 6):
             for k in range(of):
                 cut = {n: v[k * v.size // of : (k + 1) * v.size // of] for n, v in flight.table.items()}
-                cause = flight.result(cut).likely_cause
+                replayed = flight.replayed(cut)
+                cause = compare.compare_flight(*replayed).likely_cause
                 parts, accused = parts + (of > 1), accused + (of > 1 and cause is not None)
                 if cause is not None:
                     print(f"{flight.name}, part {k + 1} of {of}: {cause.sentence}")
+                comparison = flight_comparison(*replayed)
+                complete = complete or comparison
+                if complete and comparison and (model := comparison.recommended):
+                    # the last model is that of the flight file
+                    rmse_db = dict(zip(complete.models, complete.scores.rmse_db, strict=True))
+                    costs_db.append(rmse_db[model] - rmse_db[None] if model in rmse_db else np.inf)
+                    print(f"{flight.name}, part {k + 1} of {of}: {model.name}, {costs_db[-1]:+.2f} dB on the flight")
     print(f"accused: {accused} of {parts} healthy thirds and sixths")
+    most_db = max(costs_db, default=0.0)
+    print(f"other models recommended: {len(costs_db)}, with at most {most_db:+.2f} dB on the complete flight")
 
 
 def time_of_cause(field: Path, keep: Path) -> None:

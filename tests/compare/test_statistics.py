@@ -367,3 +367,9 @@ def test_models_of_equal_error_are_called_different_at_most_as_often_as_stated()
         truth_held += low <= 0 <= high
     assert wrong <= 15  # 5 % of 150 is 7.5
     assert truth_held + wrong == 150
+
+
+def test_a_level_is_flat_below_a_fifth_of_every_prediction() -> None:
+    wave_db = np.linspace(-5.0, 5.0, 101)
+    for factor, flat in ((0.19, True), (0.21, False)):
+        assert statistics.is_flat(factor * wave_db, [3.0 * wave_db, wave_db]) is flat

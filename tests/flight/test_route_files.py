@@ -150,6 +150,13 @@ def test_landings_returns_and_heights_above_ground(tmp_path: Path) -> None:
     ] == ["return", "above the ground"]
 
 
+def test_a_turn_before_the_first_point_and_points_on_the_equator(tmp_path: Path) -> None:
+    file = tmp_path / "a.plan"
+    points = waypoint((0.0, 20.0, 40.0)), waypoint((0.0, 20.001, 40.0))
+    file.write_bytes(plan(item(115, 90, 0, 1, 0, 0, 0, 0), *points))
+    assert read_route(file)["longitude_deg"].tolist() == [20.0, 20.001]
+
+
 def test_a_table_with_its_own_yaw(tmp_path: Path) -> None:
     file = tmp_path / "a.csv"
     file.write_text(f"lat,lon,height_m,yaw_rad\n35.7,-78.7,30,{math.pi / 2}\n35.71,-78.7,30,-0.1\n")

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from aerpaw_cmp.compare.calibration import OFF, Correction
 from aerpaw_cmp.compare.field_gp import FieldModel
@@ -40,7 +41,9 @@ def test_a_model_that_beats_free_space_is_called_better_with_its_interval() -> N
     )  # its offset and places count
     assert said is not None
     assert float(said[2]) < float(said[1]) < float(said[3])
-    assert "90 % intervals contain " in listed
+    error, sd = chosen.held_out[LEARNED]
+    inside = 100.0 * np.mean(np.abs(error) <= norm.ppf(0.95) * sd)
+    assert f"90 % intervals contain {inside:.0f} % of the held-out samples." in listed
     assert "The residual field (a spatial correction) is off" in listed
     # what holds is no warning, nor is what the prediction was learned from
     assert cautions(chosen, 0.1) == []

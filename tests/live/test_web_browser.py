@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -422,9 +423,8 @@ def test_the_demo_of_the_readme(driver, tmp_path, capsys):
         assert tapped.returncode == 0, err
         until(driver, "!document.getElementById('ended').hidden")
         assert "SIGINT" in text(driver, "ended-text")
-        assert f"aerpaw-cmp ingest {log} {telemetry} --timezone America/New_York --draft flight.yaml" in text(
-            driver, "commands"
-        )
+        shown = ["ingest", str(log), str(telemetry), "--timezone", "America/New_York", "--draft", "flight.yaml"]
+        assert shlex.split(text(driver, "commands").splitlines()[0]) == ["aerpaw-cmp", *shown]
         assert [path.suffix for path in log.iterdir()] == [".jsonl"]
         ingested = ["ingest", log, telemetry, "--timezone", "America/New_York", "--draft", tmp_path / "flight.yaml"]
         assert main([*map(str, ingested)]) == 0

@@ -153,7 +153,7 @@ def test_a_name_that_can_never_apply_is_refused(
     ("changes", "code", "found"),
     [
         ({"link": {"rss": {"carrier_hz": 3.3}}}, 2, "line 2: link.rss.carrier_hz: 3.3 Hz is not the frequency"),
-        ({"link": {"rss": {"carrier_hz": 15e9}}}, 2, "no values for 'medium_dry_ground' at 15 GHz"),
+        ({"link": {"rss": {"carrier_hz": 15e9}}}, 2, "no values for 'medium_dry_ground' (ground_material) at 15 GHz"),
         ({"link": {"rss": {"carrier_hz": 3.3e9, "uav": {"antenna": {"model": "file", "file": "no.txt"}}}}}, 3, "no.txt"),
         ({"link": {"rss": {"carrier_hz": 3.3e9, "uav": {"slant_deg": [1.0, 2.0]}}}}, 2, "2 slants for 1 elements"),
     ],
@@ -184,7 +184,7 @@ def test_a_dry_run_reads_the_receiver_and_the_recommendation(tmp_path: Path, cap
     ("options", "found"),
     [
         (("--carrier-ghz", "3400"), "3.4e+12 Hz is not the frequency"),
-        (("--carrier-ghz", "34"), "no values for 'medium_dry_ground' at 34 GHz"),
+        (("--carrier-ghz", "34"), "no values for 'medium_dry_ground' (ground_material) at 34 GHz"),
         (("--rank-altitude", "40"), "1 rank height at or above 30 m"),
     ],
 )

@@ -54,7 +54,7 @@ def test_in_and_out_and_in_again(room: Path, tmp_path: Path, capsys: pytest.Capt
         first.faces.material
     )
     assert main(["site", "export", str(out), "-o", str(tmp_path / "out")]) == 0
-    assert capsys.readouterr().out.split()[-1] == str(tmp_path / "out" / "scene.xml")
+    assert capsys.readouterr().out.rstrip().endswith(str(tmp_path / "out" / "scene.xml"))
     again = tmp_path / "again.yaml"
     run_scene_import(tmp_path / "out" / "scene.xml", again, SceneOptions(origin="35.7,-78.7", towers=["T=-5,3,10"]))
     second = paths_of(again)

@@ -307,16 +307,8 @@ def test_a_flight_file_without_antennas_is_offered_the_same(tmp_path, capsys) ->
     _, content = drafted(merged_mat, tmp_path, site)
     names = content.pop("antennas")
     (tmp_path / "bare.yaml").write_text(yaml.safe_dump(content))
-    words = [
-        "report",
-        str(tmp_path / "bare.yaml"),
-        "-o",
-        str(tmp_path / "bare"),
-        "--audit",
-        "none",
-        "--figures",
-        "none",
-    ]
+    bare = str(tmp_path / "bare.yaml")
+    words = ["report", bare, "-o", str(tmp_path / "bare"), "--audit", "none", "--figures", "none"]
     assert main([*words, "--recommend", str(tmp_path / "best.yaml")]) == 0
     assert yaml.safe_load((tmp_path / "best.yaml").read_text())["antennas"] == names
     capsys.readouterr()

@@ -122,18 +122,8 @@ def test_a_file_of_many_parts_is_that_of_one(written, folder, short_parts, monke
     replayed = channel.replay_poses
     monkeypatch.setattr(channel, "replay_poses", lambda *a, **k: (sizes.append(len(a[3])), replayed(*a, **k))[1])
     out = folder / "parts"
-    line = [
-        "channel",
-        str(folder / "plan.yaml"),
-        "-o",
-        str(out),
-        *ALONG.split(),
-        "--format",
-        "netcdf",
-        "--format",
-        "csv",
-    ]
-    assert main(line) == 0
+    formats = ["--format", "netcdf", "--format", "csv"]
+    assert main(["channel", str(folder / "plan.yaml"), "-o", str(out), *ALONG.split(), *formats]) == 0
     assert len(sizes) > 3
     assert sum(sizes) == 16
     with xarray.open_dataset(out / "channel.nc") as book:

@@ -92,17 +92,8 @@ def test_a_power_in_watts_is_refused(place: Path, capsys: pytest.CaptureFixture[
 
 def test_carrier_beside_flights_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sample = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
-    words = [
-        "predict",
-        str(place / "points.csv"),
-        "--with",
-        str(sample),
-        "--carrier-ghz",
-        "2.4",
-        "-o",
-        str(place / "p"),
-    ]
-    assert main(words) == 2
+    words = ["predict", str(place / "points.csv"), "--with", str(sample), "--carrier-ghz", "2.4"]
+    assert main([*words, "-o", str(place / "p")]) == 2
     assert "--with and --carrier-ghz" in capsys.readouterr().err
 
 

@@ -162,9 +162,13 @@ def plain(name: str) -> str:
     >>> plain("H\u00f6he [m]"), plain("\u7ecf\u5ea6")
     ('height m', 'longitude')
     """
-    written = name.lower().translate(_LETTERS)
-    english = _TRANSLATED.sub(lambda word: f" {_WORDS.get(word[0], 'other')} ", written)
-    return re.sub(r"[^a-z0-9]+", " ", english).strip()
+    if _WORD.search(name):
+        name = _TRANSLATED.sub(lambda word: f" {_WORDS.get(word[0], 'other')} ", name.lower().translate(_LETTERS))
+    return re.sub(r"[^a-z0-9]+", " ", name).strip()
+
+
+# A letter, or a character that may be one in another script.
+_WORD = re.compile(r"[A-Za-z]|[^\x00-\x7f]")
 
 
 _BRACKETS = re.compile(r"[\[(\uff08]([^\[\]()\uff09]{1,24})[\])\uff09]")
@@ -191,9 +195,11 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     >>> level.quantity.name, level.unit, level.place
     ('RSRP', 'dbm', 'n1')
     """
+    # return early for numbers and times, because sniffers test every cell of the first lines
+    if words is None and not _WORD.search(name):
+        return None
     bare, unit = without_unit(name)
     texts = [plain(name) if words is None else words]
-    # return early for numbers and times, because sniffers test every cell of the first lines
     if not re.search("[a-z]", texts[0]):
         return None
     if texts[0] == plain(name):

@@ -191,6 +191,8 @@ def stale_of(frame: pd.DataFrame, what: str) -> tuple[BoolArray, str]:
     begins = np.concatenate([[0], np.flatnonzero((np.diff(place_m[:, :2], axis=0) != 0).any(axis=1)) + 1])
     last = np.append(begins[1:], len(rows)) - 1
     lasts_s, moved_m = np.abs(time_s[last] - time_s[begins]), travel_m[last] - travel_m[begins]
+    if not (lasts_s > _STALE_S).any():
+        return none, ""
     if not steps_m.any():
         leaps = np.isin(begins, _runs(time_s, place_m)[0])[1:]
         step_m = np.linalg.norm(np.diff(place_m[begins, :2], axis=0), axis=1) * leaps
@@ -480,17 +482,19 @@ class _Check:
         if len(level) < _FEW_ALTERNATE:
             return
         lags = [lag for lag in range(1, _MOST_TURNS + 1) if len(level) >= 3 * lag]
-        step, *back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in lags)
+        steps = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in lags)
         # two devices: the level returns within the next records, more exactly than after fading
-        turns = step > _APART_DB and min(back) < _BACK_SHARE * step
-        # in most series few times repeat, and grouping them is slow
-        if not turns and 3 * np.count_nonzero(np.diff(np.sort(time, kind="stable"))) > 2 * len(time):
+        turns = (step := next(steps)) > _APART_DB and min(steps) < _BACK_SHARE * step
+        order = np.argsort(time, kind="stable")
+        begins = np.flatnonzero(np.append(True, np.diff(time[order]) != np.timedelta64(0, "ns")))
+        repeated = np.diff(begins, append=len(time)) > 1
+        if not turns and 2 * repeated.sum() < len(begins):
             return
-        at_once = pd.Series(level).groupby(time).agg(["min", "max", "size"])
-        apart_db = (at_once["max"] - at_once["min"])[at_once["size"] > 1]
-        if not turns and (2 * len(apart_db) < len(at_once) or apart_db.median() < _AT_ONCE_DB):
+        levels = level[order]
+        apart_db = (np.maximum.reduceat(levels, begins) - np.minimum.reduceat(levels, begins))[repeated]
+        if not turns and np.median(apart_db) < _AT_ONCE_DB:
             return
-        apart, when = (step, "from record to record") if turns else (apart_db.median(), "at the same time")
+        apart, when = (step, "from record to record") if turns else (np.median(apart_db), "at the same time")
         self._said.append(
             f"{self._what}: its levels alternate, {apart:.0f} dB apart {when}: several devices, SIMs or networks in "
             "one series, without a known column that names them"

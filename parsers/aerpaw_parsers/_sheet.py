@@ -76,9 +76,10 @@ def header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, l
             filled = [name or group for group, name in zip(names, below, strict=False)]
             # if merged cells, such as tower names, are above the names, their empty cells are filled with the names
             # below, and names that they repeat belong to several towers
-            names_below = len(below) == len(names) and not any(map(_VALUE.match, below))
-            grouped = names_below and any(name and not group for group, name in zip(names, below, strict=True))
-            grouped |= names_below and len({*below}) < len(below) and not is_header(names)
+            grouped = len(below) == len(names) and ("" in names or len({*below}) < len(below))
+            grouped = grouped and not any(map(_VALUE.match, below))
+            if grouped and not any(name and not group for group, name in zip(names, below, strict=True)):
+                grouped = len({*below}) < len(below) and not is_header(names)
             if len(names) > 1 and is_header(filled if grouped else names) and not any(map(_stamps.is_dated, names)):
                 return i + grouped, separator, filled if grouped else names
     return None

@@ -200,7 +200,8 @@ def _plan_flight(
 def _candidates(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     """Return the tool's patterns and the routes of files. UsageError if none of them may be flown."""
     flyable = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
-    candidates = [replace(c, refused=c.refused or _blocked(c.route.position_m, site)) for c in flyable]
+    footprints = shapely.STRtree([building.footprint for building in site.buildings])
+    candidates = [replace(c, refused=c.refused or _blocked(c.route.position_m, site, footprints)) for c in flyable]
     if all(candidate.refused for candidate in candidates):
         first = f"{candidates[0].route.name} {candidates[0].refused}" if candidates else "no pattern is in the geofence"
         raise UsageError(
@@ -210,13 +211,13 @@ def _candidates(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     return candidates
 
 
-def _blocked(position_m: FloatArray, site: Site) -> str:
+def _blocked(position_m: FloatArray, site: Site, footprints: shapely.STRtree) -> str:
     """Return the reason for a refusal if a track (n, 3) is too near to a building, otherwise an empty text."""
     legs = np.stack([position_m[:-1], position_m[1:]], axis=1)
-    lines, lowest_m = shapely.linestrings(legs[..., :2]), legs[..., 2].min(axis=1)
-    for building in site.buildings:
-        low = lowest_m < building.base_m + building.height_m + _CLEARANCE_M
-        if low.any() and shapely.dwithin(lines[low], building.footprint, _CLEARANCE_M).any():
+    near = footprints.query(shapely.linestrings(legs[..., :2]), predicate="dwithin", distance=_CLEARANCE_M)
+    for leg, number in sorted(near.T.tolist(), key=lambda pair: pair[1]):
+        building = site.buildings[number]
+        if legs[leg, :, 2].min() < building.base_m + building.height_m + _CLEARANCE_M:
             return f"passes less than {_CLEARANCE_M:g} m from building '{building.name}' ({building.height_m:g} m high)"
     return ""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight.route_files import read_route
@@ -128,7 +129,8 @@ def test_a_track_through_or_near_a_building_is_refused(away_m: float, above_m: f
     west, _, east, north = barn.footprint.bounds
     up = barn.base_m + barn.height_m + above_m
     track = np.array([[west - 500, north + away_m, up], [east + 500, north + away_m, up]])
-    assert bool(next_flight._blocked(track, replace(site, buildings=(barn,)))) == refused
+    footprints = shapely.STRtree([barn.footprint])
+    assert bool(next_flight._blocked(track, replace(site, buildings=(barn,)), footprints)) == refused
 
 
 def test_without_a_geofence_the_area_is_that_of_the_site() -> None:

@@ -485,18 +485,11 @@ class _Check:
         steps = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in lags)
         # two devices: the level returns within the next records, more exactly than after fading
         turns = (step := next(steps)) > _APART_DB and min(steps) < _BACK_SHARE * step
-        order = np.argsort(time, kind="stable")
-        begins = np.flatnonzero(np.append(True, np.diff(time[order]) != np.timedelta64(0, "ns")))
-        repeated = np.diff(begins, append=len(time)) > 1
-        if not turns and 2 * repeated.sum() < len(begins):
+        apart_db, when = (step, "from record to record") if turns else (_at_once_db(level, time), "at the same time")
+        if not (turns or apart_db >= _AT_ONCE_DB):
             return
-        levels = level[order]
-        apart_db = (np.maximum.reduceat(levels, begins) - np.minimum.reduceat(levels, begins))[repeated]
-        if not turns and np.median(apart_db) < _AT_ONCE_DB:
-            return
-        apart, when = (step, "from record to record") if turns else (np.median(apart_db), "at the same time")
         self._said.append(
-            f"{self._what}: its levels alternate, {apart:.0f} dB apart {when}: several devices, SIMs or networks in "
+            f"{self._what}: its levels alternate, {apart_db:.0f} dB apart {when}: several devices, SIMs or networks in "
             "one series, without a known column that names them"
         )
 
@@ -545,6 +538,16 @@ class _Check:
             row = int(np.argmax(bad))
             why = "written before the clock was set" if stamp[row] < _CLOCK_SET_NS else "days from all other records"
             self._flag(bad, "time_out_of_range", np.datetime_as_string(time[row], unit="s"), why)
+
+
+def _at_once_db(level: FloatArray, time: AnyArray) -> float:
+    """Return the median difference (max - min) of levels (n,) at one time (n,) [dB]. NaN if most times occur once."""
+    order = np.argsort(time, kind="stable")[: np.count_nonzero(~np.isnat(time))]  # NaT is last
+    begins = np.flatnonzero(np.append(True, np.diff(time[order]).astype(np.int64)))[: len(order)]
+    repeated, levels = np.diff(begins, append=len(order)) > 1, level[order]
+    if 2 * repeated.sum() < max(len(begins), 1):
+        return np.nan
+    return float(np.median((np.maximum.reduceat(levels, begins) - np.minimum.reduceat(levels, begins))[repeated]))
 
 
 def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: Sequence[str]) -> pd.DataFrame:

@@ -523,15 +523,18 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
     channels = tuple(model.evidence.name for model in alone)
     where = channels[0] if len(channels) == 1 else f"{len(channels)} channels"
     others = [shown[0][frozenset([other])].trials[0].sentence for other in names[1:]]
-    step = trial.next_step
-    if len(channels) > 1:  # the step names the clearest channel only
-        step = step.replace(f"for {channels[0]}", "for both" if len(channels) == 2 else "for these channels")
+    those = {1: channels[0], 2: "both"}.get(len(channels), "these channels")
     return Cause(
         name=" or ".join(names), channels=channels, estimate=trial.estimate[0], ci95=trial.estimate[1:],
         sentence=f"Likely cause at {where}: {', or '.join([trial.sentence, *others])}; "
         f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
-        next_step=step, rmse_db=rmse, rmse_with_db=rmse_with, gain=gain,
+        next_step=trial.next_step.replace(_CHANNELS, those), rmse_db=rmse, rmse_with_db=rmse_with, gain=gain,
     )  # fmt: skip
+
+
+# Where a next step changes flight.yaml. The last word is replaced by the channels of the named cause.
+_CHANNELS = "CHANNELS"
+_IN_LOGS = f"in `logs:` for {_CHANNELS}"
 
 
 def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, search: bool = True) -> NoiseFit:
@@ -781,9 +784,9 @@ _JUMP_M, _FASTEST_MPS = 5.0, 25.0
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
     """Yield the log of another tower."""
     for name, level in e.other_towers_db.items():
-        sentence, step = f"the log comes from {name}", f"`node: {name}` in `logs:` for {e.name}"
+        sentence, step = f"the log comes from {name}", f"`node: {name}` {_IN_LOGS}"
         if name in e.towers:  # a tower cannot have two logs of one channel, so the logs are swapped
-            step = f"swap {name} and {e.tower} in `logs:` for {e.name}"
+            step = f"swap {name} and {e.tower} {_IN_LOGS}"
         change_db, cost = level - e.predicted_db, math.log(len(e.other_towers_db))
         yield Trial(name="tower", cost=cost, sentence=sentence, next_step=step, change_db=change_db)
 
@@ -991,7 +994,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
         # levels that vary are noise. Their means over seconds vary less, so a margin above the median is enough.
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         sentence = f"{share:.0f} % of samples are at {Printed(level):.0f} {e.unit}: not detected"
-        step = f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in `logs:` for {e.name}"
+        step = f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` {_IN_LOGS}"
         estimate = level, level, level
         yield Trial(name="no detection", clipped=e.least, estimate=estimate, sentence=sentence, next_step=step)
 
@@ -1056,7 +1059,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
         return None
     name, words, step = _LIMITS[side]
     sentence = words.format(level=f"{Printed(limit):.0f} {e.unit}")
-    next_step = step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}", name=e.name)
+    next_step = step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}")
     return Trial(name=name, sentence=sentence, next_step=next_step)
 
 
@@ -1083,7 +1086,7 @@ _OVER_FLOOR_DB = 3.0
 
 
 _LIMITS = {
-    1.0: ("floor", "the log has no level below {level}", "`floor_db: {typed}` in `logs:` for {name}"),
+    1.0: ("floor", "the log has no level below {level}", "`floor_db: {typed}` " + _IN_LOGS),
     -1.0: ("saturation", "the log has no level above {level}", "lower the gain; use only lower levels"),
 }
 

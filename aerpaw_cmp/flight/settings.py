@@ -547,9 +547,10 @@ class Caution:
     used: bool = False
 
 
+LOG_EXAMPLE = "{path: LW1/log.txt, reader: sounder_log, node: LW1}"
 _NO_LOGS = (
     "a plan without logs. 'predict' and 'channel' need 'logs: []'; 'report' reads and 'simulate' writes logs that are "
-    "listed as {path: LW1/log.txt, reader: sounder_log, node: LW1}"
+    f"listed as {LOG_EXAMPLE}"
 )
 
 

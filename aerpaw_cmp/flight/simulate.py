@@ -31,7 +31,7 @@ from ..propagation.geometry import Link, Poses, rotation_from_aircraft
 from ..site.site import Site
 from .data import site_place
 from .replay import replay_poses
-from .settings import FlightFile, LogSettings, PlanSettings, files_of
+from .settings import LOG_EXAMPLE, FlightFile, LogSettings, PlanSettings, files_of
 from .track import interpolated
 
 # Name of the file of the true values.
@@ -291,8 +291,8 @@ class FlightSimulator:
         if plan is None:
             raise UsageError("the flight file has no plan", expected="flight.plan with start and waypoints")
         if not self.settings.logs:
-            entry = "{path: LW1/log.txt, reader: sounder_log, node: LW1}"
-            raise UsageError("the flight file lists no log to write", expected=f"entries under 'logs', such as {entry}")
+            expected = f"entries under 'logs', such as {LOG_EXAMPLE}"
+            raise UsageError("the flight file lists no log to write", expected=expected)
         if self.settings.timezone is None:
             raise UsageError("the flight file names no time zone", expected="such as timezone: America/New_York")
         self.plan = plan

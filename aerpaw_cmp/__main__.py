@@ -224,7 +224,10 @@ def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
 
 
 def _code_of_output(code: int) -> int:
-    """Return the exit code after flushing standard output. Otherwise a failure would be found only at exit."""
+    """Return the exit code after flushing standard output.
+
+    Without the flush, a failed write would appear only at exit.
+    """
     fault = interrupts.output_fault()
     if fault is None or code:
         return code

@@ -129,7 +129,7 @@ class Interrupted(BaseException):
 
 
 def _bare(hint: Any) -> Any:
-    """Return a hint without the ``Optional`` that Python 3.10 adds to options whose default is None."""
+    """Return a type hint without the ``Optional`` that Python 3.10 adds to options whose default is None."""
     inner = get_args(hint)[:1]
     return inner[0] if get_origin(hint) is Union and get_origin(inner[0]) is Annotated else hint
 

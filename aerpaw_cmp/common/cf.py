@@ -159,7 +159,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
 
 
 def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple[int, ...]:
-    """Return the shape of a chunk of about 1 MiB or less. Along other unlimited dimensions than the first it is 1."""
+    """Return the shape of a chunk of about 1 MiB or less. Along all unlimited dimensions except the first, it is 1."""
     sizes = dict(zip(dims, values.shape, strict=True))
     fixed = math.prod(size for name, size in sizes.items() if name not in grows)
     step = max(1, min(sizes.get(grows[0], 1), (1 << 20) // max(values.dtype.itemsize * fixed, 1)))

@@ -19,7 +19,10 @@ from shapely.geometry.base import BaseGeometry
 
 
 def content_digest(*values: Any) -> str:
-    """Return the SHA-256, in hexadecimal, of values and their contents. Opaque objects never match others."""
+    """Return the SHA-256, in hexadecimal, of values and their contents.
+
+    Objects of unknown types never have equal digests.
+    """
     digest = hashlib.sha256()
     for value in values:
         _feed(digest, value)

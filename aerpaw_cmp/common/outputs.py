@@ -766,7 +766,7 @@ class Sink:
         return int(self._spared(self._stream.write, block, instead=len(block)))
 
     def read(self, size: int = -1) -> bytes:
-        """Read bytes, zeros after a failure or the end."""
+        """Read bytes. After a failure, and beyond the end, the bytes are zeros."""
         block = self._spared(self._stream.read, size, instead=b"")
         return bytes(block.ljust(max(size, 0), b"\0"))
 

@@ -286,7 +286,7 @@ class _Builder:
             self._fail(event, f"the file expands to more than {_MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
-        """Return the scalar, list or mapping that begins with an event. Its anchor can be used after its end."""
+        """Return the scalar, list or mapping that begins with an event. An alias can name it only after its end."""
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._fail(event, f"the alias '*{event.anchor}' names no anchor above it, or contains itself")

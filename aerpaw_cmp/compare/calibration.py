@@ -421,7 +421,7 @@ Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
 def parts_left_out(
     observed: Sequence[Observed], recipe: Recipe, without: Mapping[str, Learned], parts: Parts
 ) -> tuple[Score, ...]:
-    """Score predictions of each part of a flight from other flights, without their samples that resemble the part.
+    """Score predictions of each part of a flight, learned from samples of other flights that do not resemble the part.
 
     The offset is fitted to samples of the flight outside the part, so that nothing is fitted to the part itself.
 
@@ -431,7 +431,7 @@ def parts_left_out(
         Samples of all flights.
     recipe : Recipe
     without : mapping of str to Learned
-        Gains learned with each flight left out. Their strengths are used again.
+        Learned gains by held-out flight. Their strengths are not fitted again.
     parts : callable
         :func:`altitude_parts`, :func:`heading_parts` or :func:`sector_parts`.
 
@@ -714,7 +714,7 @@ def _model(title: str, channels: Mapping[str, Channel]) -> FieldModel:
 
 @dataclass(frozen=True, slots=True)
 class _Fold:
-    """The samples of a held-out part, and the known samples that it is predicted from."""
+    """The samples of a held-out part, and the samples from which they are predicted."""
 
     known: list[LinkSamples]
     left_out: list[LinkSamples]

@@ -87,13 +87,13 @@ class Trial:
 
     @cached_property
     def designs(self) -> tuple[Columns, ...]:
-        """The columns for the fits, which share the whitened values of the columns. Empty if there are none."""
+        """The columns as one object for many fits, which whiten them only once. Empty if there are none."""
         return () if self.columns is None else (Columns(self.columns),)
 
 
 @dataclass(frozen=True, slots=True)
 class _Model:
-    """Faults of one channel, with their gain in log likelihood minus their cost."""
+    """One explanation of a channel's error: its faults, and their gain in log likelihood minus their cost."""
 
     evidence: LevelEvidence
     trials: tuple[Trial, ...]
@@ -137,8 +137,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             if any(either <= pair for pair in named):
                 continue
             lead = _lead(either, odds) / len(showing)
-            # an almost certain cause may leave an error whose cause is not certain, so also judge it together with that
-            # cause
+            # after an almost certain cause, an error with an uncertain second cause may remain, so also judge both
+            # together
             apart = (beside, best) if lead >= _CERTAIN else (beside,)
             if any(all(_explains(other, showing, lead, rest - either) for other in either) for rest in apart):
                 named[either] = showing
@@ -154,7 +154,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         return _by_health(None, tables)
     # a gain over directions comes last, because it can look like many faults
     either = min(named, key=lambda e: (CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
-    # one of two causes may be of the UAV: then it must be likely on all channels, not only on those that show the other
+    # if one of two causes is a fault of the UAV, it must be likely on all channels, also on those without the other
+    # cause
     names = [
         name
         for name in _likeliest_first(either, best, odds)
@@ -239,7 +240,7 @@ def _judged(sound: _Model) -> Judged | None:
 
 
 def _rivalled(step: Step, known: Sequence[tuple[Judged, _Models]]) -> bool:
-    """Check whether another candidate explains as much of the error as a step, under the noise of held-out flights."""
+    """Check whether another cause explains the error as well as a step, given the noise of held-out flights."""
     squares: dict[str, float] = {}
     for channel, table in known:
         before = channel.square(channel.error_db)
@@ -366,8 +367,8 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     most = _MOST_IN_HALVES[usual is not None or alone_db <= _MOST_OF_ERROR * known_db]
     if name == CATCH_ALL and (known_db < _LEAST_DB or (lead < _SURE_GAIN and not _holds_in_halves(alone, most))):
         return False
-    # the settings already remove this floor, so it is not news, and the low links that remain look too strong because
-    # of it
+    # the settings already remove samples at this floor. Weak links that remain look too strong, because only their
+    # upward fading is above the floor.
     if name == "floor" and sound[0].evidence.floored:
         return False
     if usual is None:
@@ -384,16 +385,16 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
 
 
 def _holds_in_halves(models: Sequence[_Model], most: float) -> bool:
-    """Check whether a gain over directions that is fitted to one half of the flight reduces the error of the other."""
+    """Check whether a gain over directions, fitted to one half of the flight, reduces the error of the other half."""
     pairs = ((m.evidence.measured_db - m.evidence.predicted_db, m.trials[0].columns) for m in models)
     squares = [squares_of_halves(error, columns, _CORRELATED_BINS) for error, columns in pairs if columns is not None]
     before, after = np.sum(squares, axis=0)
     return bool(after <= most**2 * before)
 
 
-# A gain is fitted to one half of the flight. Largest ratio of the RMSE of the other half with the gain to the RMSE
-# without the gain. The second ratio applies to learned antennas, and to a gain after which at most the next share of
-# the RMSE remains, because halves of a short flight show few directions.
+# A gain is fitted to one half of the flight and tested on the other half, where it must reduce the RMSE at least to the
+# first share. The second share is used instead with learned antennas, and if the gain reduces the RMSE of the complete
+# flight at least to the third share. Such a gain is plausible, although halves of a short flight show few directions.
 _MOST_IN_HALVES, _MOST_OF_ERROR = (0.75, 0.85), 0.5
 # Number of means per independent sample of the error. Halves may have different directions, so the test of halves is
 # skipped if the log odds per channel reach the second number. Even learned antennas have an error of 3 dB and more, so
@@ -979,7 +980,7 @@ _CONTROLS_S = (10.0, 20.0, 40.0)
 
 
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the noise that the receiver writes without lock, by the quality in the log."""
+    """Yield the loss of receiver lock, if the log contains samples without lock. Their levels are noise."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
         # the report has a caution with the number of these samples, and its first sentence already states the error
         # with the floor. The log itself shows this fault, so there is no penalty for being rare.
@@ -988,7 +989,7 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield samples without detection, which have the same least level."""
+    """Yield missing detection, if many samples have the lowest level of the log."""
     if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
         # levels that vary are noise. Their means over seconds vary less, so a margin above the median is enough.
@@ -1000,7 +1001,10 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _limits(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a floor and a ceiling, or a constant level: an input without signal, or all levels beyond a limit."""
+    """Yield a floor and a ceiling of the level.
+
+    For a level that is constant throughout, yield only an input without signal.
+    """
     if is_flat(e.measured_db, [e.predicted_db]):
         sentence = f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} throughout"
         step = "check the receiver's input and gain"
@@ -1064,7 +1068,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
-    """Return a soft limit: the power of a floor is added, or the level approaches a ceiling."""
+    """Return a soft limit: the power of a noise floor is added to the level, or the level approaches a ceiling."""
     if (trial := _limited(e, limit, side)) is None:
         return None
     # start from the median, which the samples at the limit hardly affect

@@ -10,8 +10,8 @@ drift_s)``. The lengths have physical bounds (:data:`BOUNDS`), because an unboun
 over positions. Channels are fitted separately.
 
 :class:`FlownFlights` computes the standard deviation after a planned flight. The standard deviation of a Gaussian
-process depends only on the directions and positions of the route, not on the levels. The antennas are modelled by
-:mod:`.gains`, and what they do not explain by a field.
+process depends only on the directions and positions of the route, not on the levels. In this class, :mod:`.gains`
+models the antennas, and a field over positions models the rest of the residual.
 """
 
 from __future__ import annotations

@@ -1094,8 +1094,9 @@ class FlightEvidence:
     def of_link(self, number: int, known: Moments, alternative: float = -math.inf) -> Evidence:
         """Return the evidence for the learned antennas of both ends of one series, by its number.
 
-        ``known`` returns the moments of the gain of both ends, without the part that its table of pairs does not
-        explain. The learned antennas must also be more likely than ``alternative`` (a log likelihood).
+        ``known`` returns mean and covariance of the sum of both gains. The variance that the table of the joint gain
+        does not explain is added here. The learned antennas must also be more likely than ``alternative`` (a log
+        likelihood).
         """
         rows, noise = self.rows[number], self._noise[number]
         if not len(rows):
@@ -1141,7 +1142,10 @@ class FlightEvidence:
 
 
 def judged(own: float, of: Callable[[float], float]) -> Evidence:
-    """Return the evidence from log likelihoods: ``own`` of an unknown gain, ``of(rotation)`` of a learned gain."""
+    """Return the evidence from log likelihoods.
+
+    ``own`` is the log likelihood of an unknown gain, ``of(angle)`` that of a learned gain rotated by an angle [deg].
+    """
     learned = of(0.0)
     # skip the three rotated copies if the gain is already clearly worse
     turned = max(map(of, _TURNS_DEG)) if learned > own - _HOPELESS else math.inf

@@ -149,7 +149,7 @@ def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> 
 
 
 def _noise(series: Sequence[tuple[FloatArray, FloatArray]]) -> Noise:
-    """Return the noise of several flights, each given by its times and errors."""
+    """Return the noise that fits several flights. Each flight consists of its times and its errors."""
     apart = [np.abs(time_s[:, None] - time_s[None]) for time_s, _ in series]
     errors = [error for _, error in series]
     variance, correlation_s = _decay(apart, errors, _LONGEST_S)
@@ -161,7 +161,7 @@ def _noise(series: Sequence[tuple[FloatArray, FloatArray]]) -> Noise:
 
 
 def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: float) -> tuple[float, float]:
-    """Return variance and length of an exponential, fitted to products of errors over their separations (n, n)."""
+    """Fit an exponential covariance to products of pairs of errors, and return its variance and correlation length."""
     pairs = [np.triu(at < longest, 1) for at in apart]
     separation = np.concatenate([at[near] for at, near in zip(apart, pairs, strict=True)])
     product = np.concatenate([np.outer(e, e)[near] for e, near in zip(errors, pairs, strict=True)])

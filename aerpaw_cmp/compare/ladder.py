@@ -287,7 +287,7 @@ def _rows(
 
 
 def _distinct(ladder: ModelComparison) -> set[int]:
-    """Return the indices of the last and the recommended model, and of models whose error no earlier model has."""
+    """Return the last and the recommended model, and all models whose errors differ from those of earlier models."""
     rmse = np.array([[_rmse(error) for error in errors] for errors in ladder.error_db])
     rmse = np.nan_to_num(rmse, nan=-1.0)  # models without an error on a channel are equal there
     known: list[int] = []

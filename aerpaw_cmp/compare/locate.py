@@ -144,8 +144,8 @@ FEWEST = 20
 # spacing is used.
 _REACH_M, _SPACING_M = 400.0, 40.0
 
-# Largest numbers of positions of the first grid, and after dividing. The first grid has 1, 2, 4, 8 ... times the
-# spacing. The likeliest positions are then divided until the spacing is reached.
+# Largest number of positions of the first grid, and largest number after its positions are divided. The first grid has
+# 1, 2, 4, 8 ... times the spacing. The likeliest positions are then divided until the spacing is reached.
 _MOST_GRID, _MOST_DIVIDED = 500, 500
 
 # The level of a node this far away hardly changes along a flight. Levels that fit such a distant node as well as the
@@ -288,7 +288,8 @@ class _Shadowing:
     """Shadowing and scatter of the levels of a track.
 
     ``root`` (k, k) is the inverse lower root of the covariance of the k levels above the floor. ``across`` (j, k) times
-    their whitened values predicts the shadowing of the j levels below the floor. Its covariance is ``left`` (j, j).
+    their whitened values predicts the shadowing of the j levels below the floor. The covariance of the prediction error
+    is ``left`` (j, j).
     """
 
     root: FloatArray
@@ -357,7 +358,7 @@ def _fit(
 
 
 def _whitened(features: FloatArray, seen: BoolArray, shadow: _Shadowing) -> tuple[FloatArray, FloatArray]:
-    """Return whitened features above the floor (m, k, terms + 1), and below it given these (m, j, terms + 1)."""
+    """Return features of k levels above the floor, whitened, and of j levels below it, given those above."""
     flat = features.reshape(len(features), -1)
     above = shadow.root @ flat[seen]
     below = flat[~seen] - shadow.across @ above

@@ -284,7 +284,7 @@ class PairResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankFurther:
-    """Numbers of the rank of a tower other than those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
+    """Further numbers of the rank at a tower, in addition to :class:`~aerpaw_cmp.compare.rank.RankComparison`.
 
     ``n_flagged`` counts samples by reason. The keys of ``foliage`` are foliage model and K. ``commonest`` is the score
     of the constant forecast. ``repeat`` is the agreement between the modem's reports at positions that both halves of
@@ -351,7 +351,7 @@ class RankResult:
 
     @property
     def singular_ratio_db(self) -> FloatArray:
-        """Ratios of all other singular values to the first, shape (n, m - 1) [dB]. They determine the rank."""
+        """Ratios of all other singular values to the first, shape (n, m - 1) [dB]. These ratios determine the rank."""
         with np.errstate(invalid="ignore"):  # 0 / 0 without a channel
             return db_from_amplitude(self.sigma[:, 1:] / self.sigma[:, :1])
 

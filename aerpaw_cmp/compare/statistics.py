@@ -333,7 +333,7 @@ class WeightedCorrelations:
     stretches: FloatArray
 
     def joined(self, name: str) -> FloatArray:
-        """Return a column of both records, over time and over position."""
+        """Return one attribute of the correlations over time, followed by that of the correlations over position."""
         return np.concatenate([getattr(part, name) for part in self.parts])
 
 
@@ -387,7 +387,7 @@ class Channels:
         log = joined.joined("log_det") - 0.5 * terms * np.log(each)
         equal, fast = np.ones(len(RATES)), np.where(RATES > _VISIBLE, 1.0, 0.0)
         over_time = [fast if share else equal for share in WHITE_SHARES]
-        over_place = known.weights[len(known.parts[0].power) :]  # the weights of ``placed``, which does not use them
+        over_place = known.weights[len(known.parts[0].power) :]  # the weights of the correlations over position
         over_place = over_place / over_place.max(initial=1e-300)
         prior = np.concatenate([*over_time, equal, 0.0 * over_place, fast, equal, over_place])
         shown = prior * np.exp(further * (log - log.max()))
@@ -410,9 +410,9 @@ def likelihoods(slow: FloatArray, parts: Sequence[CorrelationSet] = ()) -> tuple
 
 @cache
 def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the same evenly spread draws for every sequence: uniform, chi-squared of ``terms`` degrees, two normals.
+    """Return quasi-random draws: one uniform, one chi-squared with ``terms`` degrees of freedom, and two normal.
 
-    They are a Kronecker sequence in four dimensions.
+    The draws are a Kronecker sequence in four dimensions, and are the same for every sequence of errors.
     """
     from scipy.special import gammaincinv, ndtri
 
@@ -530,7 +530,7 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
 
 
 def power_draws(values: FloatArray, place_m: Track = None) -> FloatArray:
-    """Return draws of the expected variance of sequences with this length and spacing.
+    """Return random draws of the expected variance of a sequence with the length and spacing of ``values``.
 
     The draws are in the same order as in :func:`mean_draws`. A correlation longer than the sequence affects only its
     mean.
@@ -1162,7 +1162,7 @@ class _Places:
 
 @dataclass(frozen=True, slots=True)
 class _Prepared:
-    """A pass that is prepared for pairing: positions of its levels and residuals, numbers of its cells, and means."""
+    """A pass prepared for pairing: positions of levels and residuals, indices of cells, and means over cells."""
 
     number: int
     flown: Pass
@@ -1203,7 +1203,7 @@ def pass_pairs(
     pairs: dict[tuple[int, int], PassPair] = {}
     for first, second in combinations(flights.values(), 2):
 
-        @cache  # the links of a pair of flights share its searches
+        @cache  # all links of a pair of flights share the searches for partners
         def met(mine: _Places, theirs: _Places) -> tuple[IntArray, IntArray]:
             return mine.partners(theirs, radius_m, heading_within_deg)
 

@@ -47,7 +47,10 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return channels with an offset and enough samples, without copies. If any has a signal, omit all others."""
+    """Return channels with an offset and enough samples, without copies.
+
+    If any has a signal, omit those without a signal.
+    """
     some = [p for p in without_copies(panels) if not p.score.at_edge]
     enough = [p for p in some if p.score.n >= statistics.FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
@@ -583,7 +586,7 @@ _HUBER = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """A step of an offset: its first night, the night after which it was found, and its size with a 95 % interval.
+    """A step of an offset: first night, last night that was needed to find it, and size with a 95 % interval.
 
     ``back`` is the night at which the old level returned, if it did so after one or two nights, else empty.
     """
@@ -749,7 +752,7 @@ class _Segment:
 
 
 def _split_nights(segment: _Segment, window: int) -> tuple[_Segment, list[tuple[float, float]]]:
-    """Return the segment without its last ``window`` nights, and these nights."""
+    """Split a segment before its last ``window`` nights, and return both parts."""
     return replace(segment, values=segment.values[:-window]), segment.values[-window:]
 
 

@@ -492,7 +492,10 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
 
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
-    """Return features (g, q) of directions (g, 3). Their products are the covariance of a gain of unit variance."""
+    """Return features (g, q) of directions (g, 3).
+
+    Inner products of features are covariances of a gain of unit variance.
+    """
     finite = np.isfinite(direction).all(axis=1)
     unit = direction[finite] / np.linalg.norm(direction[finite], axis=1, keepdims=True)
 

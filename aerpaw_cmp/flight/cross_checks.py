@@ -425,7 +425,10 @@ def _name_starts(path: str) -> list[tuple[datetime, str, timedelta]]:
 
 
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
-    """Return the smallest difference of a time, read as UTC or local time (in any zone if unknown), from the start."""
+    """Return the difference of a time from the start.
+
+    The zone of the time, if it is not known, is the one that fits best.
+    """
     if not exact:
         # for a date without a time, compare with noon
         return abs(start - time - timedelta(hours=12))

@@ -91,7 +91,7 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
 
 
 def spread_of(stated: LearnedSpread | None) -> Spread:
-    """Return the error model of a learned antenna. If it has none, only the gain has an error."""
+    """Return the error model of a learned antenna. An antenna without error model has only the error of its gain."""
     return NO_SPREAD if stated is None else Spread(**stated.model_dump())
 
 

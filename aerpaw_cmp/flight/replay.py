@@ -81,7 +81,7 @@ class Replayed:
         return site.towers[tower].position_m[None, :]
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
-        """Return values per replayed pose at their samples, shape (n, ...)."""
+        """Expand values per replayed pose to all samples, shape (n, ...). Samples without a pose get ``fill``."""
         return _spread(self.valid, values, fill)
 
 

@@ -591,7 +591,7 @@ class FlightFile(StrictModel):
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
-        """The warnings about named learned antennas and receivers. Those that do not fit are not used."""
+        """The warnings about named learned antennas and receivers that do not fit and are therefore not used."""
         return self._cautions
 
     @property

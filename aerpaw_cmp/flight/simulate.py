@@ -65,7 +65,7 @@ class Trajectory:
         return interpolated(time_s, self.time_s, self.position_m)
 
     def velocity_at(self, time_s: FloatArray) -> FloatArray:
-        """Return velocities (n, 3) to east, north and up [m/s]. They are zero while the UAV waits."""
+        """Return velocities (n, 3) to east, north and up [m/s]. Velocities are zero while the UAV waits."""
         # assign the time of the last corner to the last leg
         leg = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
@@ -250,7 +250,7 @@ class FlightSimulator:
     Attributes
     ----------
     truth_ : dict
-        All true values, after :meth:`run`.
+        Content of truth.json: the true values of all simulated errors. It is complete after :meth:`run`.
     """
 
     def __init__(self, settings: FlightFile, site: Site, folder: Path) -> None:

@@ -8,7 +8,8 @@ A fingerprint ``<start>f<digits>f<runs>`` has three parts:
 - ``digits``: one digit every half second for the change of a level or a rank. It is the mean over 1 s minus the mean
   over 10 s, in steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
 - ``runs``: the smallest hashes of short runs of changes between values, in steps of half a decibel (a bottom-k
-  sketch, Broder 1997), 8 hex digits each. Many remain after rounding to 0.1 dB. Another flight has different hashes.
+  sketch, Broder 1997), 8 hex digits each. A quarter of the hashes do not change if levels are rounded to 0.1 dB. The
+  hashes of another flight are different.
 
 Two fingerprints belong to one log if they share runs, or if their clocks agree and their digits correlate at some lag.
 The digits of a log correlate with the digits of a part of it, and of a thinned, resampled, rounded or scaled copy. The
@@ -55,8 +56,9 @@ _SLACK, _HOUR = 120, 7200
 # data, the largest z values of two different logs are 7.3 and 5.7, and the smallest of a changed copy is 8.6.
 _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 
-# Number of changes per run, smallest number of changes in a run that are not 0 (constant levels occur in every log),
-# and strides. Because of the strides, a copy with every second to fifth row has the same runs.
+# Number of consecutive changes in a run, smallest number of them that must differ from 0 (because constant levels occur
+# in every log), and strides. Runs are also formed from every second to every fifth row, so that a copy with fewer rows
+# has the same runs.
 _RUN, _LEAST_CHANGES, _STRIDES = 16, 8, (1, 2, 3, 4, 5)
 
 # Steps in which changes are counted [dB]. The second step is for logs without changes as large as the first step. The

@@ -234,8 +234,8 @@ def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | Non
     simulated_db = case.levels.simulated_db
     above_db = simulated_db - series.link.transmit_power_dbm - lock.gain_db
     expected_db = lock.locked_db + lock.locked_per_db * above_db + score.offset_db - simulated_db
-    # a flight whose levels in lock are stronger than those of other flights at the same path gain also loses its lock
-    # at a lower path gain
+    # if the levels of this flight are stronger than those of other flights at the same path gain, the receiver also
+    # loses its lock at a lower path gain
     own_db = (error_db - expected_db)[locked].mean()
     parts = LostLock(
         probability=_forecast(series, lock).probability(simulated_db + own_db),

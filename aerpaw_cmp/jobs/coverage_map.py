@@ -1,7 +1,8 @@
 """The ``map`` job: coverage and rank maps in several foliage modes, their study, and the record of the page.
 
 Paths do not depend on arrays or foliage, so each chunk of positions is searched once. Single elements, arrays and all
-foliage modes are evaluated on these paths. For a foliage mode, only links with foliage are evaluated again.
+foliage modes are evaluated on these paths. The foliage modes differ only in links through foliage, so only these links
+are evaluated once per mode.
 """
 
 from __future__ import annotations

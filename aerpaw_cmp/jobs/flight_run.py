@@ -51,7 +51,7 @@ from ..site.siteyaml import known_grounds
 from .audit_flight import audit_replays
 from .compare_flight import Levels, compare_flight, fitted_receiver, levels_of
 
-# Loss of the weakened ground reflection: a smooth half-space reflects more than any real field.
+# Loss of the weakened ground reflection: a smooth half-space reflects more than any real ground.
 _WEAK_GROUND_DB = 10.0
 
 # Smallest reduction of the RMSE that is visible on a page [dB].

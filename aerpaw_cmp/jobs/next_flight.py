@@ -77,7 +77,7 @@ class PlanOptions:
     minutes, speed_mps : float
         Flight time of the battery [min], and speed [m/s].
     heights_m : tuple of float
-        Heights of the tool's patterns, above take-off.
+        Heights of the patterns that this command proposes, above take-off.
     tower_distance_m : float
         Smallest horizontal distance to towers.
     fence : Path, optional
@@ -198,7 +198,7 @@ def _plan_flight(
 
 
 def _candidates(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
-    """Return the tool's patterns and the routes of files. UsageError if none of them may be flown."""
+    """Return the proposed patterns and the routes from files. Raise UsageError if none of them may be flown."""
     flyable = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
     footprints = shapely.STRtree([building.footprint for building in site.buildings])
     candidates = [replace(c, refused=c.refused or _blocked(c.route.position_m, site, footprints)) for c in flyable]
@@ -283,7 +283,7 @@ def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
 
 
 def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
-    """Return the tool's patterns, without those that leave the area between legs."""
+    """Return the proposed patterns, without those that leave the area between legs."""
     out = []
     for height, (azimuth, turns), nose in product(plan.heights_m, [(0.0, False), (90.0, False), (0.0, True)], NOSES):
         # a pattern with turns contains all headings, so other nose settings would be repetitions

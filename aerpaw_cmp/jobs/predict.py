@@ -402,7 +402,7 @@ def _table(
     learned: tuple[Mapping[str, Source], Flown | Memory | Prior, Receivers],
     progress: Progress,
 ) -> pd.DataFrame:
-    """Return the rows of every tower and channel, then of every receiver.
+    """Return the table of a prediction: rows for every tower and channel, then rows for every receiver of ranks.
 
     Numbers are float32, because float64 would take gigabytes for a million points.
 

@@ -63,7 +63,7 @@ _EXPECTED = (
 # A file of more bytes, or with more rows (towers times positions), is refused: a row needs 200 bytes of memory.
 _MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 
-# If all positions of a prediction are farther than this from the site's origin [m], it is refused as another area's.
+# A prediction is refused if all its positions are farther than this from the site's origin [m].
 _FAR_M = 50_000.0
 
 # A larger level or loss [dB] is a fill value: no radio link loses 400 dB.

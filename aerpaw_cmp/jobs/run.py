@@ -433,7 +433,7 @@ def run_map(
     settings : MapSettings
     options : RunOptions
     flights : sequence of Path
-        Flight files that correct the levels and ranks (:mod:`.predict`).
+        Flight files from which the corrections of levels and ranks are learned (:mod:`.predict`).
     figures : {"none", "png", "svg", "pdf", "all"}
         Format of figures as files: none, one format, or all formats.
 

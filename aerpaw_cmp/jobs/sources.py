@@ -601,7 +601,7 @@ class Memory:
         )
 
     def sources(self) -> dict[str, Source]:
-        """Return one link per antenna, with isotropic ends."""
+        """Return one link per learned antenna. Both ends are isotropic, because the model adds the learned gains."""
         out = {}
         for antenna, memory in self.known.items():
             series, level = memory.series, memory.level

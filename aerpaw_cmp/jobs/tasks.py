@@ -200,7 +200,10 @@ _ARRAY = "array of the entry"
 
 
 class _Arrays:
-    """Arrays by name. Each is stored once: channels of a tower share times and positions (half of the size)."""
+    """Arrays by name.
+
+    Equal arrays are stored once, which halves the size: channels of a tower share times and positions.
+    """
 
     def __init__(self) -> None:
         self.by_name: dict[str, AnyArray] = {}

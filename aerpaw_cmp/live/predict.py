@@ -114,7 +114,7 @@ class RunningInterval:
         return self._sorted[beyond], self._sorted[n - 1 - beyond]
 
     def add(self, residual: float) -> None:
-        """Add a residual after its interval was reported."""
+        """Add a residual. Read the interval for this residual before, because the residual changes later intervals."""
         bounds = self.bounds()
         outside = bounds is not None and not bounds[0] <= residual <= bounds[1]
         if bounds is not None:

@@ -281,7 +281,7 @@ class Tap:
         found = []
         with contextlib.suppress(ports.PortGoneError):
             now = ports.find_port(last.path, roots)
-            if now.interface == last.interface:  # else the number belongs to another port of the modem
+            if now.interface == last.interface:  # otherwise it is another port of the modem
                 found.append(now)
         if last.product is not None:
             known = {port.device for port in found}

@@ -248,7 +248,9 @@ def _split(name: str, what: Meaning | None) -> tuple[str, str]:
 
 
 def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
-    """Return the meanings of columns. Levels and identities with the same other words in their names get one ``place``.
+    """Return the meanings of columns.
+
+    Levels and identities whose names otherwise have the same words get the same ``place``.
 
     If a place has several identities, such as "PCI A" and "PCI B", it has several cells: "RSRP A" is the level of the
     first cell.

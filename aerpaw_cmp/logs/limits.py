@@ -10,10 +10,10 @@ impossible values (a corrupted digit, an overflow, a sentinel) and not unusual v
 Speeds reveal wrong clocks and positions: no small aircraft flies faster than 100 m/s, or gains 10 m/s in a second.
 
 If a few positions cannot be reached in time from the rows around them, the receiver jumped. They are flagged and read
-as missing. So is a distant position at which a log begins or ends at rest, such as the origin of an autopilot's filter.
-Positions that do not change although a speed is logged are stale. They are also flagged and read as missing. If a track
-is too fast throughout, its times are in another unit. If a track is at two positions at the same time, it belongs to
-two vehicles. Both cases are reported, and the values are not changed.
+as missing. A distant position at which a log begins or ends at rest, such as the origin of an autopilot's filter, is
+treated in the same way. Positions that do not change although a speed is logged are stale. They are also flagged and
+read as missing. If a track is too fast throughout, its times are in another unit. If a track is at two positions at the
+same time, it belongs to two vehicles. Both cases are reported, and the values are not changed.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def typical_speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
 
 
 def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> Callable[[IntArray, IntArray], BoolArray]:
-    """Return a function of two arrays of rows that returns the mask of pairs that no aircraft can reach in time.
+    """Return a function ``(first, second) -> mask`` of pairs of rows between which no aircraft can fly in the time.
 
     The limits are the speed of the fastest aircraft, and the speed of this aircraft around these rows plus the gain
     that its thrust allows.
@@ -162,7 +162,7 @@ def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> Callable[[IntArray
 
 
 def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the first rows, and the rows after the last, of the runs between fast steps of a track."""
+    """Divide a track at its fast steps. Return the first row of each run, and the row after its last row."""
     rows = np.arange(len(time_s))
     begins = np.concatenate([[0], np.flatnonzero(_out_of_reach(time_s, place_m)(rows[:-1], rows[1:])) + 1])
     return begins, np.append(begins[1:], len(time_s))
@@ -401,7 +401,7 @@ class _Check:
         self._flag(bad, flag, first, f"where {low:g} .. {high:g} can be{hint}", names)
 
     def _at_a_site_if_otherwise(self) -> None:
-        """Report possible positions that would be at a site of AERPAW with swapped angles, another sign or unit."""
+        """Report positions that would be at a site of AERPAW if angles were swapped or had another sign or unit."""
         if not {*PLACE[:2]} <= set(self.frame.columns):
             return
         # use the median, which is not affected by jumps of the receiver

@@ -225,8 +225,8 @@ _BLANK_LINES = re.compile(rb"\A(?:[ \t]*\r?\n)+")
 def claims(data: bytes) -> list[Reader]:
     """Return the readers whose sniffers accept the beginning of a file, without blank lines before it.
 
-    If no reader of logs accepts the first ``HEAD_BYTES``, the sniffers see ``DEEP_BYTES``, because a console or a KML
-    may be recognised late. Readers of files that are not logs are tried last.
+    If no reader of logs accepts the first ``HEAD_BYTES``, the sniffers get ``DEEP_BYTES``, because the first typical
+    line of a console or a KML may come late. Readers of files that are not logs are tried last.
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
     heads = (data[:HEAD_BYTES], data) if len(data) > HEAD_BYTES else (data,)

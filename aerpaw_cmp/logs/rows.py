@@ -5,8 +5,8 @@ equivalent for readers that find their rows in another way. ``Rows.number`` and 
 ``Rows.stream`` returns a stream of columns, and ``Rows.result`` completes the account.
 
 :func:`text_reader` makes a reader from a :class:`LineFormat`, which contains the regular expression of the rows, and
-the streams of the columns. It adds sniffing, the account of all lines, times, and the treatment of truncated last
-lines.
+the streams of the columns. The reader recognises files of the format, converts times, accounts for all lines, and flags
+truncated last lines.
 """
 
 from __future__ import annotations

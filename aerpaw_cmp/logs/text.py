@@ -425,7 +425,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
         back = np.flatnonzero(np.diff(wall_ns // 1_000_000_000) <= -1800)
         behind = ambiguous.copy()
         behind[: back[0] + 1 if len(back) else None] = False
-        # the second occurrence of the hour is later, by the change of the clock
+        # when an hour occurs a second time, its UTC is later by the change of the clock
         utc[behind] += np.repeat((first - second)[index], length)[behind] * 1_000_000_000
         warnings.append(
             f"{counted(int(ambiguous.sum()), 'time')} in the hour that occurs twice in {name}: read as daylight time "
@@ -438,7 +438,10 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
 
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the starts of runs of times within a quarter of an hour, the distinct quarters, and each run's quarter."""
+    """Divide times at quarters of an hour.
+
+    Return the start of each run, the distinct quarters, and each run's quarter.
+    """
     # look up the zone once per quarter of an hour
     bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
     starts = np.flatnonzero(np.diff(bucket, prepend=bucket[:1] - 1))

@@ -487,7 +487,7 @@ def paper_scores(grid: Grid, values: FloatArray, fit: variogram.BiExponential, s
 
 
 def kriging_wins(scores: Mapping[str, Score]) -> int:
-    """Count the fields (heights and K) for which Kriging has the smallest MAE of the paper's interpolators."""
+    """Count the fields (heights and K) for which Kriging has a smaller MAE than the paper's other interpolators."""
     kriging, makima, spline = (scores[name].mae for name in ("Kriging", "makima", "spline"))
     return int(((kriging <= makima) & (kriging <= spline)).sum())
 

@@ -55,7 +55,10 @@ PLANES = ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "c
 
 @dataclass(frozen=True, slots=True)
 class Tiling:
-    """A grid in square tiles with ``cells`` positions per side, numbered like positions. The last may be smaller."""
+    """A grid in square tiles with ``cells`` positions per side, numbered like positions.
+
+    Tiles at the edge may be smaller.
+    """
 
     grid: Grid
     cells: int

@@ -50,7 +50,7 @@ def replay_in_parts(
     Parameters
     ----------
     site, link, poses, search, field, run
-        The same as in :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+        The same as in :func:`aerpaw_cmp.propagation.replay.replay`. The engine must be ``image``.
     size : int
         Largest number of poses per part. The parts have about the same size.
 
@@ -218,7 +218,7 @@ def replay_moving(
     sources_m : (poses, 3)
         Centre of the tower's array at each pose, east, north, up [m].
     search, field, run
-        The same as in :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+        The same as in :func:`aerpaw_cmp.propagation.replay.replay`. The engine must be ``image``.
 
     Returns
     -------

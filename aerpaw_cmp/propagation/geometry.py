@@ -82,7 +82,7 @@ class Faces:
     lower, upper : (faces, 2)
         Bounds of the in-plane coordinates; infinite for the ground.
     polygon : tuple of Polygon or None, length faces
-        Outline of the face in its plane, if it does not fill its bounds.
+        Outline of each face in its plane, or None for a face that fills its bounds.
     solid : (faces,) int
         Index of the building, -1 for the ground, which does not block paths.
     """

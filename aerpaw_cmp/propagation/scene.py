@@ -1,4 +1,4 @@
-"""Geometry of a replay."""
+"""The scene of a replay: faces and towers in the form that the path search needs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .geometry import Faces, Link, Links, Poses, Surfaces, inside_solids, site_f
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Geometry of a replay.
+    """The geometry of a replay: faces, towers, and links without a path.
 
     Parameters
     ----------

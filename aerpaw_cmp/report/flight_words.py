@@ -120,8 +120,8 @@ def first_sentence(
 ) -> str:
     """Return the sentence about the error of ray tracing and of one baseline in all flights of a campaign.
 
-    This is the best of the baselines that are significantly better than ray tracing on more channels than they are
-    worse. If there are none, it is the best of all baselines.
+    It is the best baseline of those that are significantly better than ray tracing on more channels than worse. If
+    there are none, it is the best of all baselines.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ BEYOND = "The best offset of {name} is outside its search range."
 
 
 def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
-    """Return begin and end of a segment of a series with these sample times (n,)."""
+    """Return the start and end times of a segment. ``time`` (n,) contains the sample times of the series."""
     first = time.min()
     begin, end = (first + np.timedelta64(round(seconds * 1e9), "ns") for seconds in (span.start_s, span.end_s))
     return begin, end
@@ -538,7 +538,7 @@ _SMALL_ERROR_DB = 3.0
 def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -> str:
     """Return the sentence of a flight without a likely cause, which is empty after a good result."""
     if all(is_stuck(panel.measured_db) for panel in panels):
-        return TWO_LEVELS  # even if the error is small
+        return TWO_LEVELS  # also if the error is small
     if is_one_place(panels):
         return ONE_PLACE
     good = pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0)

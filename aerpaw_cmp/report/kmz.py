@@ -36,7 +36,7 @@ RANKS = class_scale("rank", "Rank", ("Z", "rank 1", "rank 2", "rank 3", "rank 4"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coloured:
-    """A quantity along a link. Its ``values`` (n,) colour the track. ``unit`` is empty for ranks."""
+    """A quantity along a link. The track is coloured by its ``values`` (n,). ``unit`` is empty for ranks."""
 
     name: str
     scale: Scale

@@ -42,7 +42,7 @@ TITLES = {
 # Flags of points. Outside the flown area, no samples nearby reduce the standard deviation.
 FLAGS = ("outside_flown", "out_of_coverage", "no_position")
 
-# Share of points outside the flown area above which the summary names it.
+# If a larger share of the points is outside the flown area, the summary states this share.
 MANY = 0.2
 
 # Sentences about the selected model on held-out data, by the verdict of the paired interval.

@@ -59,10 +59,10 @@ class FilledPatch:
     jump_m: float
 
 
-# A patch of equal height is suspicious if it has at least this number of cells (one cell at exactly 0 m) ...
+# Smallest number of cells of a suspicious patch of equal height. At exactly 0 m, a single cell is suspicious.
 _FILLED_CELLS = 4
-# ... and the ground around it differs by more than this [m]. Equal cells on a slope rounded to whole metres differ
-# less.
+# Smallest difference between a suspicious patch and the ground around it [m]. On a slope with heights rounded to whole
+# metres, patches of equal height differ less.
 _FILLED_JUMP_M = 20.0
 # Number of cells on each side of a position in which a patch is searched.
 _WINDOW_CELLS = 300
@@ -247,7 +247,7 @@ class Dem:
             # add the height of the curved Earth above the chord, because up is measured from a plane
             bulge = share * (1 - share) * np.hypot(*way[:, :2].T) ** 2 / (2 * EARTH_RADIUS_M)
             intrusion = ground + bulge - (start[:, 2] + share * way[:, 2])
-            # ignore both ends, because the mean height of a cell may be above the foot of an antenna in it
+            # ignore both ends: the height of a cell is a mean, and may be above the foot of an antenna in the cell
             free[some] = ~((intrusion > tolerance[some]) & (share > 0.0) & (share < 1.0)).any(axis=0)
         return free
 
@@ -354,7 +354,7 @@ def _ascii_cells(line: str, gap: float, number: int) -> FloatArray:
 
 
 def _plausible(height_m: FloatArray, line: int | None = None) -> FloatArray:
-    """Return the heights if each is a gap or a possible height on Earth."""
+    """Return the heights. Raise InputError if one of them, other than a gap, cannot occur on Earth."""
     wrong = height_m[(height_m < LOWEST_M) | (height_m > HIGHEST_M)]
     if wrong.size:
         raise InputError(
@@ -478,7 +478,10 @@ class Surface:
         return Factor.of(self._between(self.place_m) + np.diag(self.error_m**2))
 
     def _waves(self, random: np.random.Generator) -> _Waves:
-        """Return a random draw of the process that ignores the points: waves whose vectors follow its spectrum."""
+        """Return a random surface with the covariance of the process. It does not pass through the points.
+
+        It is a sum of waves, whose wave vectors are drawn from the spectrum of the process.
+        """
         # the spectrum of order 3/2 is Student's t with 3 degrees of freedom: a normal divided by sqrt(chi-squared / 3)
         vector = random.standard_normal((2, _WAVES)) / (self.length_m * np.sqrt(random.chisquare(3, _WAVES) / 3.0))
         height = self.deviation_m * np.sqrt(2.0 / _WAVES)

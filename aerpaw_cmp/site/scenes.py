@@ -70,7 +70,7 @@ def rectangle(west_m: float, east_m: float, south_m: float, north_m: float, up_m
     Returns
     -------
     Mesh
-        Two triangles.
+        The rectangle as two triangles.
     """
     corners = [(west_m, south_m, up_m), (east_m, south_m, up_m), (east_m, north_m, up_m), (west_m, north_m, up_m)]
     return np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])

@@ -103,7 +103,8 @@ def _problem(shape: Polygon) -> str | None:
 # Largest number of trees of a forest.
 _MAXIMUM_TREES = 2_000_000
 
-_STALLED_ROUNDS = 12  # consecutive batches that add less than a thousandth, after which the forest is full
+# A forest is full after this number of consecutive batches that each add less than a thousandth of the trees.
+_STALLED_ROUNDS = 12
 
 
 # Larger than the tallest, widest and thickest trees on Earth [m]. Larger values are in feet or centimetres.
@@ -341,7 +342,7 @@ def load_site(name_or_path: str | Path, *, coordinates: str | None = None, tower
     return site
 
 
-# The last sites by their settings: one report, and each task of a campaign, requests a site several times.
+# Cache of the last sites, by their settings. A report, and each task of a campaign, requests its site several times.
 _BUILT: dict[str, Site] = {}
 _MOST_BUILT = 4
 

@@ -251,9 +251,10 @@ def few(texts: Iterable[str]) -> bool:
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
-# A column and the level alternate if the median level step within a value is below _SMALLER of the median step between
-# values, or below _SELDOM of it if the value changes less than _FEWEST times. They alternate in a fixed order if at
-# least _IN_TURN of the rows repeat the order of the rows before. _FEWEST is also the smallest number of rows.
+# A column and the level alternate if the median step of the level within one value of the column is less than a share
+# of the median step between values. The share is _SMALLER, or _SELDOM if the value changes less than _FEWEST times.
+# They alternate in a fixed order if at least _IN_TURN of the rows repeat the order of the rows before. _FEWEST is also
+# the smallest number of rows.
 _SMALLER, _SELDOM, _IN_TURN, _FEWEST = 0.5, 0.2, 0.8, 8
 
 

@@ -253,8 +253,8 @@ def from_logged_heights(
     Returns
     -------
     float array, shape (n,), or None
-        Heights as logged if home never moved in one step. Home was never set if altitude and height are always equal
-        and do not begin near zero.
+        The logged heights, unless home moved in a step: they are then computed from the altitudes and home at take-off.
+        None if altitude and height are always equal and do not begin near zero, because home was then never set.
     """
     known = np.flatnonzero(np.isfinite(home_m))
     home_m = home_m[known]
@@ -362,7 +362,7 @@ def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatAr
 def _without_unset_home(rows: Rows, height: FloatArray) -> FloatArray:
     """Return heights above take-off with NaN for leading altitudes above sea level, written before home was set.
 
-    Such altitudes are all far from 0, and the next height is near 0. No descent is so fast.
+    Such altitudes are all far from 0, and the next height is near 0. The step is faster than any descent.
     """
     fall_m, step_s = -np.diff(height), np.abs(np.diff(rows.time) / np.timedelta64(1, "s"))
     falls = (fall_m > _NEAR_ZERO_M + _CLIMB_MPS * step_s) & (np.abs(height[1:]) < _REST_M)

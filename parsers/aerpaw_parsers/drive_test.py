@@ -87,8 +87,8 @@ class _Cell:
     rat: str
     place: str
     columns: dict[str, int] = field(default_factory=dict)  # column by field of a reading
-    ports: list[int] = field(default_factory=list)  # levels of single ports, besides the cell's
-    marks: list[int] = field(default_factory=list)  # identities besides the PCI
+    ports: list[int] = field(default_factory=list)  # levels of single ports, in addition to the level of the cell
+    marks: list[int] = field(default_factory=list)  # identities other than the PCI
     quantity: str = "RSRP"  # quantity of the level
 
     @property
@@ -115,7 +115,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     cells: dict[tuple[str, str], _Cell] = {}
     fields: dict[tuple[str, str], dict[str, list[int]]] = {}
     others, marks = [], []
-    ranks: dict[bool, list[int]] = {True: [], False: []}  # by whether they are means
+    ranks: dict[bool, list[int]] = {True: [], False: []}  # means and other ranks
     for i, meaning in enumerate(sheet.meanings):
         if meaning is not None and meaning.quantity.role == "mark":
             marks.append((i, meaning))
@@ -408,7 +408,10 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
 
 
 def _keys(sheet: _sheet.Sheet, column: int) -> list[str]:
-    """Return the quantities that divide the levels of a column, among them the radio access if there are several."""
+    """Return the quantities by which the levels of a column are divided into series.
+
+    They include the radio access only if there are several.
+    """
     technology = sheet.find("technology")
     texts = () if technology is None else compress(sheet.texts(technology), np.isfinite(sheet.numbers(column)))
     return ["PCI", "ARFCN", *(["technology"] if len({*map(_rat, texts)}) > 1 else [])]
@@ -466,7 +469,7 @@ def _short(sheet: _sheet.Sheet, column: int) -> str:
     return "_".join(_SHARED.sub(" ", sheet.plain[column]).split()) or f"column{column + 1}"
 
 
-# Words that the names of several levels of a cell have in common, and other words for a measured level.
+# Words that occur in the names of all levels of a cell, and further words for a measured level.
 _SHARED = re.compile(r"\b(\w*rsrp|dbm|lte|nr|4g|5g|serving)\b")
 _MORE = re.compile(rf"{_SHARED.pattern}|\b(rssi|raw|meas(ured)?|inst|cell|ss|current)\b")
 

@@ -35,7 +35,7 @@ _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
 def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
-    """Return the layout of a topic, or None if it contains another topic. None of the topics that are read does."""
+    """Return the layout of a topic, or None if it contains another topic. The topics that are read here do not."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     for part in text.split(";"):
         if not part:

@@ -221,7 +221,8 @@ class NodeFinder:
         nodes : mapping of str to (3,)
             Positions of the nodes that were proposed for other logs of the flight [m].
         airframe : callable
-            Returns the learned airframe that the levels support. It is searched if no tower fits without it.
+            Function that returns the learned airframe that the levels support. It is called only if no tower fits
+            without one.
 
         Returns
         -------
@@ -887,7 +888,7 @@ def searching_airframe(
     site : str or Path
         Name or path, as for :func:`.read_learned`.
     log : (SHA-256, fingerprint)
-        The log of the levels. Airframes learned from it are not used.
+        The log file that contains the levels. Airframes learned from this file are not used.
     track : LevelTrack
         The levels, without antennas.
     carrier_hz : float, optional

@@ -173,7 +173,7 @@ def _explained(
         "UAV antenna",
         "polarisation",
     ]
-    terms = {name: float(step) + 0.0 for name, step in zip(names, np.round(steps, 12), strict=True)}  # no -0.0
+    terms = {name: float(step) + 0.0 for name, step in zip(names, np.round(steps, 12), strict=True)}  # avoid -0.0
     terms |= {name: 0.0 - loss for name, loss in further_db.items()}
     corners = np.concatenate([source_m[None], path.vertices_m[0, :depth], target_m[None]])
     legs = np.diff(corners, axis=0)
@@ -244,7 +244,7 @@ def why_not(
     Returns
     -------
     str
-        The first reason that was found.
+        The reason, for the first condition of a path that is not met.
     """
     if surfaces is not None:
         return _why_not_there(surfaces, source_m, target_m, sequence)

@@ -39,11 +39,13 @@ Shape = Literal["cone", "cylinder"]
 # ITU-R P.833: near 1 GHz, trees in leaf attenuate about 20 % more (dB/m) than leafless trees.
 LEAFLESS_FACTOR = 1 / 1.2
 
-_PIECE_M = 8.0  # paths are looked up in pieces of this length
+# Length of the pieces of a path that are looked up in the grid [m].
+_PIECE_M = 8.0
 # Side of a cell [m]: about the radius of a crown, so that a cell lists few crowns.
 _CELL_M = 4.0
 _MAX_CELLS = 4_000_000
-_PAIRS_AT_ONCE = 1_500_000  # pairs of piece and crown; about 150 MB of temporary arrays
+# Number of pairs of a piece and a crown that are computed together: about 150 MB of temporary arrays.
+_PAIRS_AT_ONCE = 1_500_000
 
 
 # ---------------------------------------------------------------- models: depth in foliage to loss
@@ -59,7 +61,7 @@ class Opaque:
         return np.where(np.isnan(depth), np.nan, np.where(depth > 0, np.inf, 0.0))
 
 
-# P.833 (woodland, one terminal inside) tabulated: frequency [MHz], gamma [dB/m], A_m [dB]
+# Table of P.833 (woodland, one terminal inside): frequency [MHz], gamma [dB/m], A_m [dB].
 P833_TABLE: tuple[tuple[float, float, float], ...] = (
     (105.9, 0.04, 9.4),
     (466.475, 0.12, 18.0),
@@ -67,8 +69,9 @@ P833_TABLE: tuple[tuple[float, float, float], ...] = (
     (1852.2, 0.30, 29.0),
     (2117.5, 0.34, 34.1),
 )
-_GAMMA_EXPONENT = 0.70  # slope of a log-log fit to the table
-_MAXIMUM_EXPONENT = 0.43  # A_m = A1 f^0.43, P.833's own fit for Mulhouse
+# Exponents of the frequency beyond the table: the slope of a log-log fit to it, and P.833's fit of A_m for Mulhouse.
+_GAMMA_EXPONENT = 0.70
+_MAXIMUM_EXPONENT = 0.43
 
 
 @dataclass(frozen=True, slots=True)

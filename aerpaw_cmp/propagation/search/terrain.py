@@ -21,7 +21,7 @@ from ...site.relief import Dem
 from ..geometry import Faces, Links, PathSet, joined, legs
 from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, retraced, searched_links
 
-# Value of ``solid`` for tangent planes of the terrain. For the level ground of a tower, it is -1.
+# Value of ``solid`` for tangent planes of the terrain. The level ground of a tower has the value -1.
 TERRAIN = -2
 
 # A mirror is ignored if the ground fills a smaller part of its Fresnel zone than this.
@@ -295,7 +295,10 @@ def _zone_m(along: FloatArray, at: FloatArray, excess_m: FloatArray, wavelength_
 def _settled(
     dem: Dem, source: FloatArray, target: FloatArray, along: FloatArray, crease: BoolArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Move mirrors from the profile to the surface. Return points, normals, and whether both ends are above it."""
+    """Move reflection points from the profile to the ground. Return points and normals, and which points are valid.
+
+    A point is valid if both ends of the link are above its tangent plane.
+    """
     way = target[:, :2] - source[:, :2]
     way = way / np.maximum(np.hypot(*way.T), 1e-12)[:, None]
     begin = source[:, :2] + along[:, None] * way

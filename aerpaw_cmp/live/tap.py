@@ -65,7 +65,7 @@ def _not_a_modem(path: Path, received: bytes) -> InputError:
         excerpt = ascii(modem.Redactor().clean(received[:40].decode("latin-1"), cut=True))
         sign, cause = f"the port sends {excerpt} but no answer", "another device, or another baud rate than 115200"
     else:
-        sign, cause = "nothing answers on the port", "the modem is off, still starts, or this is not its AT port"
+        sign, cause = "nothing answers on the port", "the modem is off or still starting, or this is not its AT port"
     return InputError(sign, expected=expected, cause=cause, path=path)
 
 
@@ -155,7 +155,7 @@ class Tap:
                 raise InputError(
                     str(error),
                     expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
-                    cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
+                    cause="the modem is not plugged in or is still starting; see 'aerpaw-cmp doctor'",
                 ) from None
             if not self._stop.count:
                 self._log.open()

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame, bearing_deg
+from ..common.text import counted
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
@@ -221,19 +222,20 @@ class TrackAccount:
     def warnings(self) -> tuple[str, ...]:
         """The warnings for the user, one sentence each."""
         reasons = (
-            (self.hour_steps, "step(s) of whole hours between telemetry rows: daylight-saving change or a reset clock"),
-            (self.steps_sorted, "step(s) back in time between telemetry rows: all rows were sorted by time"),
-            (self.backward_time, "telemetry row(s) out of time order were ignored"),
-            (self.duplicate_time, "telemetry row(s) repeat the time stamp before them and were ignored"),
-            (self.no_time, "telemetry row(s) without a time stamp were ignored"),
-            (self.bad_position, "telemetry row(s) without a position (NaN, -999) were ignored"),
-            (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not interpolated"),
-            (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course is assumed"),
-            (self.heading_alone, "telemetry row(s) contain only a heading: level flight in its direction is assumed"),
+            (self.hour_steps, "step", "of whole hours between telemetry rows: daylight-saving change or a reset clock"),
+            (self.steps_sorted, "step", "back in time between telemetry rows: all rows were sorted by time"),
+            (self.backward_time, "telemetry row", "out of time order: ignored"),
+            (self.duplicate_time, "telemetry row", "with the time stamp of the row before: ignored"),
+            (self.no_time, "telemetry row", "without a time stamp: ignored"),
+            (self.bad_position, "telemetry row", "without a position (NaN, -999): ignored"),
+            (self.gaps, "telemetry gap", f"(the longest {self.longest_gap_s:.1f} s): not interpolated"),
+            (self.unknown_attitude, "telemetry row", "without attitude: level flight along the course is assumed"),
+            (self.heading_alone, "telemetry row", "with only a heading: level flight in its direction is assumed"),
             (
                 self.below_ground,
-                "telemetry row(s) are below the site's ground plane and are not compared: origin.takeoff_ground_m, or "
-                "an elevation model, specifies the height of the ground",
+                "telemetry row",
+                "below the site's ground plane: not compared. origin.takeoff_ground_m, or an elevation model, specifies "
+                "the height of the ground",
             ),
         )
         usual_m, high_m = self.sparse_error_m
@@ -241,7 +243,7 @@ class TrackAccount:
             f"the telemetry has a fix every {self.sparse_s:.0f} s: positions in between are interpolated, with a "
             f"median error of about {usual_m:.0f} m and {high_m:.0f} m in one case of ten"
         )
-        return (*([sparse] if self.sparse_s else []), *(f"{count} {text}" for count, text in reasons if count))
+        return (*([sparse] if self.sparse_s else []), *(f"{counted(n, noun)} {text}" for n, noun, text in reasons if n))
 
 
 @dataclass(frozen=True, slots=True)

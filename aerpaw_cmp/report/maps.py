@@ -153,6 +153,12 @@ class MapsData(Made):
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
 
+# Meaning of the antennas of a layer, for the page and the terminal.
+ANTENNAS = (
+    "MIMO: an array at both ends, fed in phase at the tower, mean level over the elements at the UAV. SISO: one element "
+    "at both ends."
+)
+
 LEAST = "Lowest coverage: {percent:.1f} % of the positions at {where}"
 
 # Sentence and next step, by the cause of :func:`~aerpaw_cmp.compare.verdict.coverage_verdict`.
@@ -236,7 +242,7 @@ def notes(data: MapsData) -> list[str]:
     how = [
         f"Foliage {', '.join(data.settings['foliage'])}: opaque blocks paths that touch a crown or a trunk (the "
         "paper); attenuating applies ITU-R P.833 over the length of the path in crowns; none ignores trees.",
-        "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element.",
+        ANTENNAS,
         f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}.",
     ] if "foliage" in data.settings else []  # fmt: skip
     return [*data.site.notes, *how, *data.notes]
@@ -738,7 +744,7 @@ def coverage_table(data: MapsData) -> Table:
         whose = f"the other {counted(full, 'row')}" if rows else "every antenna, foliage and tower"
         rows.append((whose, "", "", *[percent(1.0, 1)] * len(heights)))
     columns = {"Antennas": TEXT, "Foliage": TEXT, "Tower": HEAD, **{f"{height:g} m": RIGHT for height in heights}}
-    caption = "Share of positions in coverage. MIMO: array, SISO: one element; joint: the nearest tower serves."
+    caption = f"Share of positions in coverage. {ANTENNAS} Joint: the nearest tower serves."
     return Table(caption=caption, columns=columns, rows=rows)
 
 

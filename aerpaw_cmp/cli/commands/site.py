@@ -241,13 +241,14 @@ def map_(
 def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
     """Print the share of covered positions per tower, antennas and height, for the foliage model of the paper."""
     from ...maps.grid import JOINT
+    from ...report.maps import ANTENNAS
 
     lines: dict[tuple[str, str], dict[str, str]] = {}
     alone = len({row["tower"] for row in rows}) == 2  # a single tower is always the nearest tower
     for row in (row for row in rows if row["foliage"] == settings.shown and not (alone and row["tower"] == JOINT)):
         tower = "nearest tower" if row["tower"] == JOINT else row["tower"]
-        antennas = "one element" if row["antennas"] == "SISO" else f"{settings.elements} elements in phase"
-        line = lines.setdefault((tower, antennas), {"tower": tower, "antennas": antennas})
+        line = lines.setdefault((tower, row["antennas"]), {"tower": tower, "antennas": row["antennas"]})
         line[f"{row['altitude_m']:g} m"] = f"{100.0 * row['coverage']:.1f} %"
     columns = {name: name for line in lines.values() for name in line}
     records(list(lines.values()), columns, f"Covered positions, foliage {settings.shown}")
+    show(ANTENNAS)

@@ -67,6 +67,9 @@ ZARR = "maps.zarr"
 # exported.
 _TILED_ABOVE, _TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
 
+# The faces of this number of buildings take seconds, during which the map has no share to report.
+_MANY_BUILDINGS = 5000
+
 
 @dataclass(frozen=True, slots=True)
 class MapSettings:
@@ -447,6 +450,8 @@ def make_maps(
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
     tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
     with stages("maps"):
+        if len(site.buildings) > _MANY_BUILDINGS:
+            stages.progress(f"walls and roofs of {counted(len(site.buildings), 'building')}")
         channels = SiteChannels(site, settings)
         evaluate = partial(channels.tile, progress=share if len(tiling) < 2 else None) if crew.count < 2 else map_tile
         order = partial(TileOrder, site=name, settings=settings, cells=tiling.cells)

@@ -26,7 +26,7 @@ from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.relief import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
-from aerpaw_cmp.site.siteyaml import join_trees
+from aerpaw_cmp.site.siteyaml import join_trees, load_site
 from tests.jobs.sent_by_pickle import SentByPickle
 from tests.json_page import unlisted
 
@@ -108,8 +108,11 @@ def test_a_broadside_beam_gains_the_number_of_elements():
     )
 
 
-def test_modes_share_one_search_and_nothing_is_kept(site):
-    outcome = coverage_map.make_maps(site, settings(), Stages())
+def test_modes_share_one_search_and_nothing_is_kept(site, monkeypatch):
+    monkeypatch.setattr(coverage_map, "_MANY_BUILDINGS", 0)  # the stage begins with a line about its buildings
+    lines: list[str] = []
+    outcome = coverage_map.make_maps(site, settings(), Stages(lambda text, *_: lines.append(text)))
+    assert lines[:2] == ["maps", "walls and roofs of 1 building"]
     alone = coverage_map.make_maps(site, settings(foliage=("opaque",)), Stages())
     assert outcome.paths == alone.paths > 0
     np.testing.assert_array_equal(outcome.maps["opaque"].rank, alone.maps["opaque"].rank)
@@ -311,9 +314,6 @@ def test_the_notes_say_where_p833_is_continued():
 
 
 def test_workers_evaluate_the_tiles_to_the_same_digit() -> None:
-    from aerpaw_cmp.common.stages import Stages
-    from aerpaw_cmp.site.siteyaml import load_site
-
     some, crew = settings(spacing_m=300.0, rank_altitudes_m=(30.0,), foliage=("none", "opaque")), SentByPickle()
     alone = coverage_map.make_maps(load_site("lake_wheeler"), some, Stages())
     shared = coverage_map.make_maps(load_site("lake_wheeler"), some, Stages(), workers=crew, name="lake_wheeler")

@@ -119,7 +119,9 @@ class Dataset:
 
 
 def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
-    """Return a NetCDF-4 file of a :class:`Dataset`. It is created in memory, because HDF5 aborts on a full disk.
+    """Return the bytes of a NetCDF-4 file with a :class:`Dataset`.
+
+    The file is created in memory, because HDF5 aborts on a full disk.
 
     Arrays are deflated. Text becomes characters in UTF-8, which every reader of CF files accepts. NetCDF has no complex
     numbers: ``NAME_real`` and ``NAME_imag`` are written instead of ``NAME``. The ``_FillValue`` of a variable with NaN
@@ -179,8 +181,8 @@ class GrowingNetcdf:
 
     Notes
     -----
-    A ``_FillValue`` other than NaN fills the file. It is then removed from the attributes, because it is a valid value,
-    such as a gain of 0 or a flag of -1, which readers would otherwise replace by NaN.
+    A ``_FillValue`` other than NaN is used to fill the file, but the attribute is removed at the end. Otherwise readers
+    would replace valid values, such as a gain of 0 or a flag of -1, by NaN.
     """
 
     def __init__(self, path: Path, grows: Sequence[str]) -> None:

@@ -873,9 +873,9 @@ def crps_difference(
 def _sd_factor(flights: Sequence[str], parts: Sequence[_HeldOut]) -> float:
     """Return the ratio of actual to stated errors of held-out parts, limited to 0.8 to 1.6, or 1 without errors.
 
-    It is a geometric mean over flights. A model that was learned from flights with small errors states a too small
-    error for a flight with large errors, and vice versa. An arithmetic mean would give more weight to the first case,
-    although the final model is fitted to all flights.
+    The ratio is the geometric mean over flights. A model that was learned from flights with small errors states a too
+    small error for a flight with large errors, and vice versa. An arithmetic mean would give more weight to the first
+    case, although the final model is fitted to all flights.
     """
     squares = lists_by_key(zip(flights, (np.square(error / sd) for error, sd in parts), strict=True))
     means = [_mean(np.concatenate(each)) for each in squares.values()]

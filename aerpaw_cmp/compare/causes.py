@@ -947,7 +947,10 @@ def _is_slope(e: LevelEvidence, factor: float, at: NoiseParameters) -> bool:
 
 
 def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) -> tuple[float, float]:
-    """Return the slope of measured over predicted levels, and its SD. It is NaN if the levels do not determine it."""
+    """Return the slope of measured over predicted levels, and its SD.
+
+    Both are NaN if the levels do not determine a slope.
+    """
     changes = (Trial(change_db=(factor + i * step - 1.0) * e.predicted_db) for i in (-1, 0, 1))
     below, middle, above = (_fitted(e, change, at=at, search=False).log_likelihood for change in changes)
     bend = below - 2.0 * middle + above
@@ -960,7 +963,7 @@ def _slope(e: LevelEvidence, factor: float, step: float, at: NoiseParameters) ->
 
 
 def _controlled(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a gain control, which follows the mean level over some time. It is an alternative without a name."""
+    """Yield trials of a gain control, which follows the mean level over some time. A report never names this cause."""
     for slow in slow_levels(e.time_s, e.predicted_db):
         # a gain control can only weaken changes of the level; stronger changes are explained by another slope
         if (e.measured_db - e.predicted_db) @ (slow - slow.mean()) < 0.0:
@@ -980,7 +983,7 @@ _CONTROLS_S = (10.0, 20.0, 40.0)
 
 
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the loss of receiver lock, if the log contains samples without lock. Their levels are noise."""
+    """Yield the loss of receiver lock, if the log contains samples without lock. Levels without lock are noise."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
         # the report has a caution with the number of these samples, and its first sentence already states the error
         # with the floor. The log itself shows this fault, so there is no penalty for being rare.

@@ -160,7 +160,7 @@ def _bin_means(values: FloatArray, member: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One Gaussian process. Its covariance is exponential, or Gaussian for the pair of ends.
+    """One Gaussian process of a gain. The covariance is exponential, or Gaussian for the pair of ends.
 
     Parameters
     ----------
@@ -756,9 +756,9 @@ USUAL_OFFSET_DB = 1.5
 def offset_sd_db(squares_db2: float, count: int, usual_db: float = USUAL_OFFSET_DB) -> float:
     """Return the SD of a normal distribution that has the 90 % band of the offset of a new flight [dB].
 
-    ``squares_db2`` is the sum of squared differences of the offsets of flights from their mean, with ``count`` degrees
-    of freedom. The SD between flights is integrated over its posterior distribution, because few flights hardly
-    determine it. The prior is log normal with the median ``usual_db`` and a factor of three. It allows almost equal
+    ``squares_db2`` is the sum of squared deviations of the flights' offsets from their mean, with ``count`` degrees of
+    freedom. The SD between flights is integrated over its posterior distribution, because few flights hardly determine
+    it. The prior is log normal with the median ``usual_db`` and a factor of three. This prior allows almost equal
     offsets, which occur in flights with the same devices.
     """
     from scipy.special import ndtr, ndtri
@@ -1061,8 +1061,8 @@ class GainProcess:
         Notes
         -----
         The process is the sum of ``A g`` and an independent remainder. ``g`` is the gain at the directions G, with
-        covariance S, and ``A = K(at, G) K(G, G)^-1`` with the prior K. The covariance of the first part is ``A S A'``,
-        that of the remainder is ``K - A K(G, at)``. The remainder is scaled so that the diagonal of the sum equals the
+        covariance S, and ``A = K(at, G) K(G, G)^-1`` with the prior K. The covariance of ``A g`` is ``A S A'``. The
+        remainder has the covariance ``K - A K(G, at)`` and is scaled so that the diagonal of the sum equals the
         variance in the table.
         """
         across = term_kernel(self.term, at, self.directions)

@@ -75,7 +75,8 @@ def learned_health(flights: Sequence[HeldOut], differences_db: dict[str, list[fl
     flights : sequence of HeldOut
         One or more flights.
     differences_db : dict of str to list of float
-        Offset of this channel minus that of another channel of the tower, per flight, by the name of the other channel.
+        For each other channel of the tower: the offset of this channel minus the offset of the other channel, per
+        flight.
     """
     errors_db = [f.error_db for f in flights]
     series = [binned(f.time_s, error_db) for f, error_db in zip(flights, errors_db, strict=True)]
@@ -208,7 +209,7 @@ class Judged:
 
     @property
     def health(self) -> LearnedHealth:
-        """Usual errors of the channel. They must be known for its antenna."""
+        """Usual errors of the channel. The learned antenna must contain them."""
         assert self.learned.health is not None
         return self.learned.health
 

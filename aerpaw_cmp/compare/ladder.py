@@ -68,7 +68,7 @@ class ModelRow:
     fastest_sufficient : bool
         True for the first model, in the order of rising cost, whose difference from the best is not significant.
     distinct : bool
-        False if the error is within 0.01 dB of that of an earlier model on every channel. The recommended model and the
+        False if an earlier model has the same error within 0.01 dB on every channel. The recommended model and the
         model of the flight file are always distinct.
     elsewhere_db : (float, float), optional
         RMSE of the recommended model and of free space on other flights [dB], if other flights selected the model.

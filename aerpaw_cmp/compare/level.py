@@ -3,9 +3,9 @@
 The functions take arrays in time order, with one value per sample and NaN for a missing value. They do not depend on
 files, sites or engines.
 
-The module compares the measured and simulated signal strength of one tower and channel. It scores predictions after a
-flight, and entries of benchmarks/published. It models receivers that lose the signal or have a floor, compares the
-predicted strongest cell with the serving cell of a phone, and sums the results of field audits.
+The module compares the measured and simulated signal strength of one tower and channel, and scores predictions after a
+flight and the entries of benchmarks/published. Further functions model receivers that lose the signal or have a floor,
+compare the predicted strongest cell with the serving cell of a phone, and sum the results of field audits.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class NoiseParameters(NamedTuple):
 
     @property
     def near(self) -> list[NoiseParameters]:
-        """These parameters, and all parameters that differ from them by one step of a single index."""
+        """These parameters, and all parameters with one index that is one step higher or lower."""
         sizes = len(_SLOW), len(_FAST), len(_SLOW_SHARE)
         steps = [(0, 0), *((i, step) for i in range(3) for step in (-1, 1))]
         moved = [tuple(p + step * (k == i) for k, p in enumerate(self)) for i, step in steps]

@@ -91,13 +91,14 @@ class ForecastScore:
     kappa, agreement : float
         Scores of the decided rank.
     majority_agreement : float
-        Agreement if the most frequent rank of these samples were always predicted. It is known only afterwards.
+        Agreement if the most frequent rank of these samples were always predicted. A forecast cannot know this rank.
     log_score, constant_log_score : float
         Means of :func:`log_losses` for the forecast and for the constant forecast [nat].
     log_score_gain : float
         Share by which the log score of the forecast is lower than that of the constant forecast.
     log_score_difference_ci95 : (low, high)
-        95 % interval of the log score of the forecast minus that of the constant forecast, on the same samples [nat].
+        95 % interval of the difference of the two log scores, forecast minus constant forecast, on the same samples
+        [nat].
     total_variation_expected : float
         Total variation distance between mean probabilities and measured histogram.
     kappa_ci95, log_score_ci95, total_variation_ci95 : (low, high)
@@ -630,9 +631,9 @@ def choose_features(
     groups : (n,) int
         Group of each sample. Each group is held out once.
     finalists : int
-        Number of candidates that are cross-validated. They are the candidates with the highest likelihood on the
-        training samples. The likelihood is a fair criterion, because all candidates have the same number of
-        coefficients. A fit takes only a tenth of the time of a cross-validation.
+        Number of candidates that are cross-validated: the ones with the highest likelihood on the training samples. The
+        likelihood is a fair criterion, because all candidates have the same number of coefficients. A fit takes only a
+        tenth of the time of a cross-validation.
 
     Returns
     -------

@@ -73,7 +73,7 @@ def level_card(
         - ``exceedance``: for each threshold the ``predicted`` and ``measured`` share of samples at or above
           ``threshold_db``. If the levels have no common reference, the offset is applied first.
         - ``outages_missed outages_invented``: number of outages for which a level was predicted, and of levels for
-        which an outage was predicted.
+          which an outage was predicted.
     """
     level = predicted["level"]
     heard, reached = np.isfinite(measured_db) & scored, np.isfinite(level) & scored

@@ -185,8 +185,8 @@ def place_correlations(place_m: Track, terms: int = TERMS, centred: bool = False
     terms : int
         Number of cosine terms.
     centred : bool
-        True for differences of squares of errors about their mean. Such errors are anticorrelated at a distance, so
-        their squares are correlated everywhere, which changes the mean and no cosine term.
+        True for differences of the squares of errors whose mean was subtracted. Such errors are anticorrelated at large
+        distances, so their squares are correlated everywhere. This changes the mean and no cosine term.
 
     Returns
     -------
@@ -243,7 +243,7 @@ def _about_mean(covariance: FloatArray) -> FloatArray:
 
 
 def _unit(covariance: FloatArray) -> FloatArray:
-    """Scale a covariance of mean and terms to a power of 1 of the terms."""
+    """Scale a covariance of the mean and the terms so that the terms have a power of 1."""
     return np.asarray(covariance / np.trace(covariance[1:, 1:]))
 
 
@@ -333,7 +333,7 @@ class WeightedCorrelations:
     stretches: FloatArray
 
     def joined(self, name: str) -> FloatArray:
-        """Return one attribute of the correlations over time, followed by that of the correlations over position."""
+        """Return one attribute of all correlations: first of those over time, then of those over position."""
         return np.concatenate([getattr(part, name) for part in self.parts])
 
 
@@ -584,7 +584,7 @@ NO_INTERVAL: Interval = (float("nan"), float("nan"))
 
 
 def independent_samples(values: FloatArray, place_m: Track = None) -> float:
-    """Return the number of independent samples whose mean would be as accurate as that of the sequence.
+    """Return the number of independent samples whose mean would be as accurate as the mean of the sequence.
 
     Parameters
     ----------
@@ -683,7 +683,7 @@ def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, pla
 
 
 def mean_interval(values: FloatArray, place_m: Track = None) -> Interval:
-    """Return the 95 % interval of the mean of the process of which a sequence (n,) in time order is a sample.
+    """Return the 95 % interval of the mean of a process, from one sequence (n,) in time order.
 
     Errors may be correlated over the positions ``place_m`` (n, 3) [m] as well, as for :func:`mean_draws`.
     """
@@ -872,9 +872,10 @@ def paired_difference(
     Notes
     -----
     Let d be the difference of the two predictions, which the route determines, and b the coefficient of a regression of
-    the error on d. The difference of the mean square errors is (2 b - 1) times the mean square of d. Its random part is
-    d times the residual of that regression (Harvey, Leybourne and Newbold 1998, doi:10.1080/07350015.1998.10524759). In
-    each segment, b comes from the other segments, so that a single segment cannot determine b.
+    the error on d. The difference of the mean square errors is (2 b - 1) times the mean square of d. The random part of
+    each sample is d times the residual of that regression (Harvey, Leybourne and Newbold 1998,
+    doi:10.1080/07350015.1998.10524759). In each segment, b comes from the other segments, so that a single segment
+    cannot determine b.
 
     Examples
     --------
@@ -1006,7 +1007,8 @@ def share_interval(indicator: FloatArray, place_m: Track = None, sequence: Float
     place_m : (n, 3), optional
         The same as in :func:`mean_draws`.
     sequence : (n,), optional
-        The sequence from which the indicator was computed. Its effective size is used if the share is 0 or 1.
+        The sequence from which the indicator was computed. The effective size of this sequence is used if the share is
+        0 or 1.
 
     Returns
     -------

@@ -712,7 +712,7 @@ class _Segment:
         return self.square + own, self.freedom + len(self.values) - 1
 
     def inflation(self) -> float:
-        """Return the variance of a mean of consecutive nights divided by that of independent nights.
+        """Return the ratio of two variances of the mean over nights: of consecutive nights, and of independent nights.
 
         The correlation is increased by its standard error, because its estimate can be too small by chance.
         """
@@ -866,8 +866,8 @@ class LevelDifference:
     offset_db : Changed
         Fitted offset, as in the reports.
     rmse : PairedDifference
-        Difference on common scored samples, after the best offset of each report for these samples. ``rmse_db`` is that
-        of the second report, ``other_rmse_db`` that of the first.
+        Difference on common scored samples, after the best offset of each report for these samples. ``rmse_db`` belongs
+        to the second report, ``other_rmse_db`` to the first.
     """
 
     tower: str

@@ -65,8 +65,8 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
 
     Each telemetry log begins a flight. A radio log belongs to the flight with which it shares most time. A log with
     relative times belongs to the flight whose track contains its positions, or else to the flight in its folder. If
-    there is only one flight, it belongs to that flight, otherwise it is a separate flight. If several logs have both
-    levels and positions but no absolute time, each of them is a flight.
+    neither is found, it belongs to the only flight, or is a separate flight if there are several. If several logs have
+    both levels and positions but no absolute time, each of them is a flight.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def _shared(first: Span | None, second: Span) -> np.timedelta64:
 
 
 def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
-    """Return the origin of relative times that puts the positions of a log on the track of a flight, or None."""
+    """Return the start of a log with relative times, at which its positions lie on the track of a flight, or None."""
     track = next((track for member in flight.files for track in _tracks(member)), None)
     # use the longest stream, because a log of a hundred cells has the positions of one receiver a hundred times
     placed = [stream for stream in file.result.streams if "latitude_deg" in stream.frame]
@@ -425,9 +425,9 @@ def _name_starts(path: str) -> list[tuple[datetime, str, timedelta]]:
 
 
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
-    """Return the difference of a time from the start.
+    """Return the difference between a time and the start of a flight.
 
-    The zone of the time, if it is not known, is the one that fits best.
+    If the zone of the time is unknown, the zone that fits best is used.
     """
     if not exact:
         # for a date without a time, compare with noon

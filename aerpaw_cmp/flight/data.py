@@ -117,7 +117,7 @@ class RssSeries:
     Parameters
     ----------
     settings_key : str
-        A key that is equal for series with equal link settings. Such series share a replay.
+        A key that is equal for series with equal link settings, which share a replay.
     log : (n,) int
         Number of the log under ``logs:`` that contains each sample.
     line : (n,) int

@@ -277,7 +277,7 @@ def load_with_learned(path: str | Path, learned: Path | None = None, overrides: 
     learned : Path, optional
         calibrated.yaml whose settings replace those of the flight file, including its named antennas.
     overrides : mapping, optional
-        Values of dotted keys. They are applied before antenna names are replaced, because an antenna must fit the
+        Values of dotted keys. Overrides are applied before antenna names are replaced, because an antenna must fit the
         carrier.
     """
     settings = with_learned(overridden(load_flight(path), overrides or {}), Path(path).parent)
@@ -373,7 +373,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
 
 
 def antennas_used(series: Sequence[tuple[str, str, LinkSettings]]) -> tuple[str, ...]:
-    """Return one sentence per pair of antennas. It names the channels if not all of them use this pair.
+    """Return one sentence per pair of antennas. The sentence names the channels if not all channels use this pair.
 
     Examples
     --------

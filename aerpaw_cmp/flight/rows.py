@@ -167,9 +167,9 @@ _NOISY, _LEAP = 1.2, 3.0
 def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> BoolArray:
     """Return a mask (n,) of samples that repeat a frozen level. The first sample of each run is not marked.
 
-    A smooth level can be constant at its maximum or at the end of its scale, and then continue smoothly. It is frozen
-    only if it jumps at the end of the run, or if the series ends with the run and had both higher and lower levels
-    before. A noisy level is frozen if the run is not due to chance.
+    A smooth level can be constant at its maximum or at the end of its scale, and then continue smoothly. Such a run
+    counts as frozen only if the level jumps at its end, or if the series ends with the run and had both higher and
+    lower levels before. A run of a noisy level counts as frozen if it cannot be due to chance.
 
     Parameters
     ----------

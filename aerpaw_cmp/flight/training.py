@@ -208,7 +208,7 @@ def _evidence(first: str, second: str) -> FloatArray:
 
 
 def _memory(left: AnyArray, right: AnyArray, size: int) -> float:
-    """Return the number of digits per independent pair (Bartlett 1935). It is larger for ranks than for levels."""
+    """Return the number of digits per independent pair (Bartlett 1935), which is larger for ranks than for levels."""
     ours, theirs = (np.fft.irfft(np.abs(x) ** 2, size)[: round(_TREND_S / _STEP_S)] for x in (left, right))
     return 2.0 * float((ours * theirs).sum() / max(ours[0] * theirs[0], 1.0)) - 1.0
 
@@ -272,7 +272,7 @@ def knows(data: FlightData, learned: Sequence[MeasuredPattern | FlightFile]) -> 
 
 
 def is_training_data(data: FlightData, trained_on: Sequence[str], marks: Sequence[str]) -> bool:
-    """Check whether a log of a flight has the SHA-256 or the fingerprint of one of the training logs."""
+    """Check whether a log of a flight is one of the training logs, by its SHA-256 or fingerprint."""
     return bool(common(flight_logs(data), [trained_on])) or any(among(mark, marks) for mark in marks_of([data]))
 
 

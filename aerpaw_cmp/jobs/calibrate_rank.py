@@ -321,7 +321,10 @@ def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
 
 
 def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
-    """Score forecasts of held-out sectors. They are fitted to other sectors, with the geometries of other flights."""
+    """Score forecasts of held-out sectors.
+
+    The forecasts are fitted to the other sectors, with geometries from other flights.
+    """
     good = samples.part(samples.rank >= 1)
     groups = receiver.sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty

@@ -127,7 +127,10 @@ def _logs(key: _Logs) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class _Logs:
-    """A cache key of logs. It compares only settings that affect how logs are read."""
+    """The cache key of the logs of a flight.
+
+    Two keys are equal if all settings that affect how logs are read are equal.
+    """
 
     folder: Path
     logs_root: Path | None

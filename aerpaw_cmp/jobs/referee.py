@@ -166,9 +166,9 @@ def read_foreign(path: Path, data: FlightData, near_m: float = AGAINST_DISTANCE_
 
 
 def possible(score: Callable[[Any], Any], predictions: Iterable[Any]) -> tuple[list[Any], list[str]]:
-    """Return the results of the predictions that can be used, and the messages of the others.
+    """Return the results of the predictions that can be scored, and a message for each other prediction.
 
-    If none can be used, the first error is raised.
+    If none can be scored, the first error is raised.
     """
     results, errors = list[Any](), list[AerpawCmpError]()
     for prediction in predictions:

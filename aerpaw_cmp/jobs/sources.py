@@ -1,8 +1,8 @@
 """Points and links of a prediction, and the models that predict them.
 
-Points are a grid over a site, a planned route, the plan or track of a flight, or a table. Links are those of the named
-flights, or those for which the site has learned antennas and levels. Before any flight, they are the links of all
-towers.
+Points are a grid over a site, a planned route, the plan or track of a flight, or a table. A prediction uses the links
+of the named flights, or the links for which the site has learned antennas and levels. Before any flight, it uses the
+links of all towers.
 """
 
 from __future__ import annotations

@@ -268,7 +268,7 @@ def open_workers(
     paths : sequence of Path
         Files and folders that every worker of a scheduler must be able to read.
     progress : Progress
-        Receives the number of workers of a scheduler and the address of its dashboard.
+        Shows the number of workers of a scheduler and the address of its dashboard.
 
     Yields
     ------

@@ -579,8 +579,8 @@ def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
 class Framer:
     r"""A parser of the answers to known commands, one of which is in flight at a time.
 
-    A command that timed out may still be answered. A late answer becomes a :class:`Late` event. Its prefix, or the echo
-    if the modem echoes, distinguishes it from the answer to the next command.
+    A command that timed out may still be answered. A late answer becomes a :class:`Late` event. The prefix of the
+    lines, or the echo if the modem echoes, distinguishes a late answer from the answer to the next command.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Conversion of lines to records, for all text formats.
 
-:func:`matched` returns the :class:`Rows` of a pattern with named groups, one of them ``time``. :func:`built` is the
-equivalent for readers that find their rows in another way. ``Rows.number`` and ``Rows.text`` return columns,
-``Rows.stream`` returns a stream of columns, and ``Rows.result`` completes the account.
+:func:`matched` returns the :class:`Rows` that a pattern with named groups matches; one of the groups is ``time``.
+:func:`built` returns :class:`Rows` for readers that find their rows in another way. ``Rows.number`` and ``Rows.text``
+return columns, ``Rows.stream`` returns a stream of columns, and ``Rows.result`` completes the account.
 
 :func:`text_reader` makes a reader from a :class:`LineFormat`, which contains the regular expression of the rows, and
 the streams of the columns. The reader recognises files of the format, converts times, accounts for all lines, and flags
@@ -203,8 +203,8 @@ def matched(
     ----------
     data : bytes
     pattern : re.Pattern
-        MULTILINE, from ``^`` to ``\r?$``, unable to cross a line end, every repetition bounded; named groups, one of
-        them ``time``.
+        Compiled with MULTILINE, from ``^`` to ``\r?$``. It must not match across a line end, and every repetition must
+        be bounded. One of its named groups is ``time``.
     reason : callable
         Function that returns why a line that does not match is rejected, or None for a header, comment or console
         output.

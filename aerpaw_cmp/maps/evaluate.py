@@ -472,7 +472,7 @@ def paper_scores(grid: Grid, values: FloatArray, fit: variogram.BiExponential, s
     fit : BiExponential
         Correlation that Kriging uses.
     sampling : Sampling
-                Samples that each interpolator uses.
+        Samples that each interpolator uses.
 
     Returns
     -------

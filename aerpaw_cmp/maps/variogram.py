@@ -3,8 +3,8 @@
 Two correlations are averaged over pairs of positions in bins of distance:
 
 - :func:`vector_correlation` is the correlation of the paper (arXiv 2502.10324, section VI-A): the Pearson correlation
-of the
-  vectors of two positions, which contain the ranks of all altitudes and K. It mixes horizontal and vertical changes.
+  of the vectors of two positions, which contain the ranks of all altitudes and K. It mixes horizontal and vertical
+  changes.
 - :func:`field_correlation` is horizontal: each field (one altitude, one K) is standardised over the positions, and the
   values of two positions are multiplied.
 
@@ -164,7 +164,7 @@ class _Projection:
         return np.asarray((self.amplitudes(log_rates)[1] ** 2).sum(axis=-1))
 
     def curve(self, log_rates: FloatArray, reasons: Sequence[str]) -> BiExponential:
-        """Return the curve with these rates. It is degenerate if there are reasons."""
+        """Return the curve with these rates. ``reasons`` state why the curve is degenerate."""
         (c1, c3), (c2, c4) = self.amplitudes(log_rates)[0].tolist(), (-np.exp(log_rates)).tolist()
         rmse = float(np.sqrt(self.cost(log_rates) / len(self.d)))
         return BiExponential(

@@ -149,10 +149,11 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
 
 
 class _Sealed:
-    """The compiled code of one kernel on disk. It is sealed: a damaged file of numba's cache can crash the process.
+    """The compiled code of one kernel on disk.
 
-    An entry is followed by its SHA-256. A damaged entry is ignored, and the kernel is compiled again. Only this user
-    can write to the folder (:func:`code_folder`), since an entry contains machine code.
+    Each entry ends with its SHA-256, because damaged machine code can crash the process. A damaged entry is ignored,
+    and the kernel is compiled again. Only this user can write to the folder (:func:`code_folder`), since an entry
+    contains machine code.
     """
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
@@ -181,7 +182,7 @@ class _Sealed:
 def part(function: Callable[..., Any]) -> Any:
     """Compile a function that kernels call and that does not create an array.
 
-    Updating the reference counts of its arrays at each call took four fifths of the time of a search. The caller keeps
-    the arrays alive, so reference counting is switched off for the function (numba's ``_nrt``).
+    Reference counting is switched off for the function (numba's ``_nrt``), because the caller keeps the arrays alive.
+    Updating the counts of the arrays at each call took four fifths of the time of a search.
     """
     return kernel(function, forceinline=True, _nrt=False)

@@ -9,8 +9,8 @@ not move is replayed exactly as a fixed tower.
 
 Channels of many antenna geometries are computed at once, for line of sight and ground reflection. The orientation of a
 modem's antennas and the slants of its ports are rarely documented. Thousands of geometries can be tried without a
-separate replay for each geometry. The field of an element slanted by ``s`` is ``cos s`` times that of a vertical
-element plus ``sin s`` times that of a horizontal element at the same position. Therefore, one evaluation with both
+separate replay for each geometry. The field of an element slanted by ``s`` is ``cos s`` times the field of a vertical
+element plus ``sin s`` times the field of a horizontal element at the same position. Therefore, one evaluation with both
 elements at every port (:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) is
 enough for all slants. The ground reflection is one ray, which can be added at any strength.
 
@@ -369,11 +369,11 @@ def singular_values_of(
     geometries : sequence of Geometry
         Geometries, grouped by mount. Each group needs one evaluation of the field, or two with the ground.
     tower : Array
-        Positions, pattern and mount of the tower. The slants are replaced by those of the geometry.
+        Positions, pattern and mount of the tower. The slants are taken from each geometry instead.
     tower_m : (3,)
         Array centre, east, north, up over flat ground at 0 [m].
     uav : Array
-        Array of the UAV. Its slants and mount are replaced by those of the geometry.
+        Array of the UAV. The slants and the mount are taken from each geometry instead.
     poses : Poses
     carrier_hz : float
 

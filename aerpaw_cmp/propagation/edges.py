@@ -122,8 +122,8 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
     Returns
     -------
     upright, across : (...)
-        The sine is never negative. Otherwise cos(less / 2) would change its sign where the target enters the shadow,
-        and with it the wave that a face converts from one polarisation into the other.
+        The sine is never negative. Otherwise, where the target enters the shadow, cos(less / 2) would change its sign,
+        and the wave that a face converts from one polarisation into the other would jump.
     """
     less = phi_out - phi_in
     up, down = (np.abs(np.sin((np.pi + turn) / (2.0 * exterior))) for turn in (less, -less))
@@ -284,7 +284,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     scene : Scene
     poses : Poses
     link : Link
-        Link. Its carrier determines which buildings are too low for diffraction.
+        The carrier of the link determines which buildings are too low for diffraction.
 
     Returns
     -------
@@ -531,8 +531,8 @@ class _End(NamedTuple):
     """One end of each path, mirrored so that the leg from it to the edge is straight.
 
     ``centre_m`` (paths, 3); ``axes`` (paths, 3, 3) of the device as rows. ``normal`` (paths, 3) and ``face`` (paths, 3)
-    belong to the leg's mirror, and ``bounced`` (paths,) is True if there is a mirror. Positions (paths or 1, 3,
-    elements) and slants (paths or 1, 2, elements) are those of the elements.
+    belong to the leg's mirror, and ``bounced`` (paths,) is True if there is a mirror. The positions (paths or 1, 3,
+    elements) and slants (paths or 1, 2, elements) belong to the elements.
     """
 
     centre_m: FloatArray

@@ -499,14 +499,14 @@ def replay(
     ----------
     site : Site
     link : Link
-        Link. Its ``tower_arrays`` name towers of the site.
+        The ``tower_arrays`` of the link name towers of the site.
     poses : Poses
     search : Search
         Options that determine the paths, such as engine and depth.
     field : Field
         Further losses of the paths.
     run : Run
-                Options that do not change the result, such as cache and progress.
+        Options that do not change the result, such as cache and progress.
 
     Returns
     -------

@@ -180,8 +180,8 @@ class SettingRank:
     quantiles_db : tuple of float
         Quantiles of 10, 50 and 90 % over flights.
     difference_db, difference_ci95_db : float, Interval or None
-        Mean over flights of the error minus that of the first setting on the same links, and its interval. The interval
-        is None for the first setting.
+        Mean over flights of the difference of two errors on the same links, this setting minus the first setting, and
+        its interval. The interval is None for the first setting.
     n_paired : int
         Number of flights in that difference.
     verdict : str

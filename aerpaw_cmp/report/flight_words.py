@@ -120,8 +120,8 @@ def first_sentence(
 ) -> str:
     """Return the sentence about the error of ray tracing and of one baseline in all flights of a campaign.
 
-    It is the best baseline of those that are significantly better than ray tracing on more channels than worse. If
-    there are none, it is the best of all baselines.
+    The sentence names the best of the baselines that are significantly better than ray tracing on more channels than
+    worse. If there are none, it names the best of all baselines.
 
     Parameters
     ----------
@@ -360,7 +360,7 @@ def learned_on(score: DetectionScore) -> str:
 
 
 def _snr_words(panel: RssResult) -> str:
-    """Return the sentence about a measured signal-to-noise ratio. Its error is stated without a fitted offset."""
+    """Return the sentence about the error of a signal-to-noise ratio without a fitted offset, or an empty text."""
     snr = panel.further.snr
     if snr is None:
         return ""

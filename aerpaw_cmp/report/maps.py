@@ -422,7 +422,7 @@ def correlation(binned: BinnedCorrelation, fit: BiExponential | None) -> dict[st
 
 
 def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
-    """Return a chart of MAE against height per method. Its scale ends at ``worst``, the largest error of all panels."""
+    """Return a chart of MAE against height per method. The axis of all panels ends at ``worst``, the largest error."""
     marks = []
     for method, rows in grouped(sorted(members, key=lambda e: e.altitude_m), lambda e: e.method).items():
         at, mae = np.array([[row.altitude_m, row.mae] for row in rows]).T
@@ -433,7 +433,7 @@ def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plate:
-    """The panels of one kind, by title. They form one figure file, and each is one chart of the page."""
+    """The panels of one kind, by title. All panels are in one figure file, and each panel is one chart of the page."""
 
     name: str
     section: str

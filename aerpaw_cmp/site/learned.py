@@ -116,8 +116,9 @@ class LearnedLock(StrictModel):
     Levels in lock have the mean ``locked_db`` at a path gain of ``gain_db``, and the SD ``locked_sd_db`` within a
     flight. They increase by ``locked_per_db`` for each dB of path gain. This factor is less than 1, because a weak
     signal is in lock only if it is stronger than expected. The values that begin with ``lost`` describe levels without
-    lock [unit of the measurement]. The scores are means over held-out flights. They are the Brier and log score (nat)
-    of the model and of a constant share, and the RMSE of all samples if the floor replaces levels below it [dB].
+    lock [unit of the measurement]. Three scores are means over held-out flights: the Brier score and the log score
+    [nat], each for the model and for a constant share, and the RMSE of all samples if the floor replaces lower levels
+    [dB].
     """
 
     gain_db: float
@@ -202,7 +203,8 @@ class LearnedHealth(StrictModel):
     step_chi2 : float
         Largest chi-squared of a step of the level in these flights.
     channel_difference_sd_db : mapping of str to float
-        SD over flights of the difference of offsets to another channel of the tower, by channel.
+        For each other channel of the tower: SD over flights of the offset of this channel minus the offset of the
+        other.
     below_lock_share : float, optional
         Mean share of samples without lock. None if the receiver does not report its lock.
     run_s : float
@@ -278,7 +280,7 @@ class LearnedReceiver(StrictModel):
     Parameters
     ----------
     quantity : str
-        Rank from which the receiver was learned, such as ``scheduled PDSCH rank``. It is only for readers.
+        Rank from which the receiver was learned, such as ``scheduled PDSCH rank``. No calculation uses this text.
     """
 
     tower: str

@@ -237,8 +237,8 @@ def without_traps(
     TriangleScene
         Scene without vegetation, and without meshes around or below an antenna.
     tuple of Forest
-        The parts of meshes of vegetation as media. A medium has the outline of its part from above, extends from the
-        lowest to the highest corner, and is filled according to the volume. Trunks are removed.
+        One medium per connected part of a vegetation mesh, without trunks. It has the outline of the part from above,
+        extends from the lowest to the highest corner, and is filled according to the volume.
     list of str
         List of actions.
     """
@@ -325,9 +325,9 @@ _GROUND_PART = 0.25
 
 
 def drawn_buildings(site: Site) -> tuple[Building, ...]:
-    """Return buildings for pictures: those of the site, and the outlines of the shapes of a scene of triangles.
+    """Return buildings for pictures: the buildings of the site, and prisms for the shapes of a scene of triangles.
 
-    Prisms extend from the lowest to the highest corner of each part. Horizontal shapes and shapes below most of the
+    Each prism extends from the lowest to the highest corner of its part. Horizontal shapes and shapes below most of the
     plan are ground. Only pictures use these prisms.
     """
     return site.buildings if site.scene is None else (*site.buildings, *_outlines(site.scene))

@@ -118,7 +118,7 @@ TrunkDiameter = Annotated[float, Field(gt=0, le=THICKEST_TRUNK_M)]
 
 
 class TreeSizes(StrictModel):
-    """The sizes of trees. The height of the base of the crown is a share of the height of the tree."""
+    """The sizes of trees. The base of the crown is at a given share of the height of the tree."""
 
     height_m: TreeHeight = 20.0
     crown_diameter_m: CrownDiameter = 10.0

@@ -331,7 +331,7 @@ def cell_names(
     about : dict
         The attributes of each name are added to it.
     nr : bool
-        Whether the names are those of NR cells.
+        True for NR cells, False for LTE cells.
     """
     texts = {i: _named(sheet, i) for i in cell_columns(sheet, nr=nr)}
     chosen = dividing_columns(texts, _with_level(sheet), base)

@@ -403,7 +403,10 @@ def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitud
 
 
 def _attitude(rows: Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
-    """Return angles in degrees. Their unit is in the name, known from the program, or guessed from the values."""
+    """Return angles in degrees.
+
+    The unit is read from the column name, known from the program, or guessed from the values.
+    """
     values = sheet.found(*ANGLES)
     named = any(sheet.unit(column) for column in map(sheet.find, values) if column is not None)
     if not named and are_radians(values):

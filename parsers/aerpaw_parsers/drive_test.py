@@ -465,7 +465,7 @@ _NUMBERED = 0.8
 
 
 def _short(sheet: _sheet.Sheet, column: int) -> str:
-    """Return a short name for a column: the words of its name without those of its quantity."""
+    """Return a short name for a column: its name without the words for the quantity and the radio access."""
     return "_".join(_SHARED.sub(" ", sheet.plain[column]).split()) or f"column{column + 1}"
 
 
@@ -537,7 +537,7 @@ def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> Iterator[int]:
 def _settle_names(sheet: _sheet.Sheet) -> None:
     """Divide G-NetTrack's ``Level`` into columns: RSRP on 4G and 5G, RSCP on 3G, RxLev on 2G.
 
-    Its ``LTERSSI`` is in dBm; older phones write steps from 0.
+    The column ``LTERSSI`` of this app is in dBm, but older phones write steps from 0, which are ignored.
     """
     if sheet.program is None or "level" not in sheet.program.words:
         return

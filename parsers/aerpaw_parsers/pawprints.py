@@ -45,7 +45,7 @@ def _reading(row: int, cell: dict[str, Any], connected: float) -> _cells.Reading
 
 
 def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
-    """Return the cells of a line in the text of 2023 under the names of the JSON, or None if its fields differ."""
+    """Return the cells of a line of the text format of 2023, named by the keys of the JSON; None for other fields."""
     decoded = []
     for block in _BLOCK.findall(line):
         cells = block.split(b",")

@@ -903,7 +903,7 @@ _MEANS_S, _OTHER_READINGS_DB = 2.0, 1.0
 def _another_channel(streams: Sequence[Stream], entry: Mapping[str, Any], earlier: Sequence[_Line]) -> str:
     """Return a channel name for a log if another log has different levels of the same tower and name at the same time.
 
-    It is empty for logs that name their channel or have cells, and for the first log and its copies.
+    The name is empty for logs that name their channel or have cells, and for the first log and its copies.
     """
     levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
     if len(levels) != 1 or {"cells", "channel"} & entry.keys() or levels[0].channel != levels[0].name:
@@ -1096,7 +1096,7 @@ def _cell_of(stream: Stream) -> int | str | None:
 
 
 def _cells(streams: Sequence[Stream]) -> list[int | str]:
-    """Return the cells of a log with at least a twentieth of the samples of its most frequent cell."""
+    """Return the cells of a log that have at least a twentieth of the samples of the most frequent cell."""
     counts = {cell: len(s.frame) for s in streams if (cell := _cell_of(s)) is not None}
     most = max(counts.values(), default=0)
     most_sampled = sorted(counts, key=lambda cell: -counts[cell])[:MOST_CELLS]
@@ -1141,7 +1141,7 @@ def _plain(entry: Mapping[str, Any]) -> str:
 def _flow(entry: dict[str, Any]) -> str:
     """Return the YAML mapping of a log on one line.
 
-    Texts are quoted if one of them looks like a number, such as 1e6.
+    All texts are quoted if one of them would be read as a number, such as 1e6.
     """
 
     def dumped(style: str | None) -> str:

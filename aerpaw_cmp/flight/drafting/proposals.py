@@ -373,7 +373,7 @@ def _node(
 def with_antennas(
     track: LevelTrack, airframe: MeasuredPattern | None, node: MeasuredPattern | None = None
 ) -> LevelTrack:
-    """Return levels with the gains of airframe and node. They are unchanged if the airframe is not known."""
+    """Return levels with the gains of airframe and node. Without a known airframe, the levels are unchanged."""
     return track if airframe is None else replace(track, airframe_db=_gain_of(airframe, node))
 
 
@@ -816,7 +816,7 @@ _MOUNTED_AS_LEARNED = 3.0
 
 
 def _named_odds(data: FlightData, series: RssSeries, item: LearnedLink, receivers: Container[str]) -> float:
-    """Return the log odds of learned antennas of both ends from the names of receiver, tower and channel."""
+    """Return the log odds of a pair of learned antennas, from the names of receiver, tower and channel."""
     receiver = data.settings.logs[int(series.log[0])].receiver if len(series.log) else ""
     if receiver in receivers:
         return _SAME_NAME if receiver == item.receiver else -math.inf
@@ -994,8 +994,8 @@ def errors_elsewhere(
         The learned antennas that the flight file names, by its keys.
     series : RssSeries
     flown : (n, 3) and (n,), optional
-        Positions [m], and standard deviation of the learned gain there [dB]. They show whether the height or the
-        directions are new: errors are then larger.
+        Positions [m], and standard deviation of the learned gain there [dB]. Errors are larger if these show that the
+        height or the directions are new.
 
     Returns
     -------

@@ -625,8 +625,8 @@ def _meets_last_face(
 ) -> tuple[IntArray, IntArray]:
     """Return the pairs (sequence, target) whose line from the last image is within the bounds of the last face.
 
-    The in-plane coordinates of the intersection are linear in those of the target, which are the same for all sequences
-    that end on the face.
+    The coordinates of the intersection in the plane of the face are linear in the coordinates of the target, and the
+    latter are the same for all sequences that end on the face.
 
     Parameters
     ----------

@@ -8,11 +8,11 @@ This module guards against silent errors of Sionna RT 2.2.0:
 - Its hash table of candidates is shared by all receivers of a call and loses paths. Therefore this module uses a table
   of 2**24 slots and batches of at most 100 poses.
 - It drops candidates beyond ``max_num_paths_per_src``, most of which are not paths in the end. It corrupts memory if
-that limit is below the number of receivers. Sionna's own count of candidates is therefore read after each batch. If a
-batch exceeded the limit, or filled too much of the table, it is searched again with larger limits. - If positions are
-given as numbers, kernels are compiled again for each position. Positions are therefore arrays here, and each batch has
-the same size (the last batch is padded). - A line of sight without Friis' amplitude, or a path with a gain above one,
-stops the run.
+  that limit is below the number of receivers. Sionna's own count of candidates is therefore read after each batch. If a
+  batch exceeded the limit, or filled too much of the table, it is searched again with larger limits.
+- If positions are given as numbers, kernels are compiled again for each position. Positions are therefore arrays here,
+  and each batch has the same size (the last batch is padded).
+- A line of sight without Friis' amplitude, or a path with a gain above one, stops the run.
 """
 
 from __future__ import annotations

@@ -77,8 +77,8 @@ _LEFT_OUT, _WITHOUT_NAT = 10, 2.0
 # Means are limited to this number of robust standard deviations from the median of this number of neighbours.
 _LONE, _NEIGHBOURS = 4.0, 9
 
-# Number of lags that are evaluated together. It limits the memory that is used.
-_AT_ONCE = 16
+# Number of lags that are evaluated together: more are faster, but take more memory (25 MB per correlation time).
+_AT_ONCE = 31
 
 
 class _Parts(NamedTuple):
@@ -90,6 +90,8 @@ class _Parts(NamedTuple):
 
 
 _START = _Parts(5.0, 0.3, 1.0)
+# Parts of each channel.
+_PartsOf = Sequence[Sequence[_Parts]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,11 +234,8 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     models = [name for name in (named[0] if named else ()) if all(name in each for each in named)]
     places = {channel.along.place: channel.along for channel in alive}
     features = {place: along.features() for place, along in places.items()}
-    bins = {
-        channel.name: b
-        for channel in alive
-        if (b := _Bins.of(channel, models, features[channel.along.place], window_s)) is not None
-    }
+    single = (_Bins.of(channel, models, features[channel.along.place], window_s) for channel in alive)
+    bins = _joined([b for b in single if b is not None])
     if not bins:
         return ClockEstimate(
             radio_minus_telemetry_s=float("nan"), ci95_s=(-window_s, window_s), verdict=CANNOT_TELL,
@@ -245,20 +244,19 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
     # find likely lags with an assumed correlation time, then fit the correlation time at these lags
-    first = np.sum([b.likelihood(lags, [_START]) for b in bins.values()], axis=0)
+    first = np.sum(np.concatenate([b.likelihood(lags, [[_START]] * len(b.names)) for b in bins]), axis=0)
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # the likeliest lag of each model, and zero
-    parts = {name: b.fitted(starts) for name, b in bins.items()}
+    parts = [b.fitted(starts) for b in bins]
 
     def likelihood(block: FloatArray) -> FloatArray:
-        return np.stack([b.likelihood(block, parts[name]) for name, b in bins.items()])
+        return np.concatenate([b.likelihood(block, each) for b, each in zip(bins, parts, strict=True)])
 
     tried, nats = _finer(lags, likelihood, window_s)
-    estimate = _judged(tried, nats, list(bins), window_s)
+    estimate = _judged(tried, nats, [name for b in bins for name in b.names], window_s)
     # channels of one computer have the same lag, so their log likelihoods are added
     total = nats.sum(axis=0).max(axis=1)  # the most likely model at each lag
-    n = sum(b.n for b in bins.values())
-    estimate = replace(estimate, model=models[int(total.argmax())], n=n)
-    explained = total.max() - sum(b.constant() for b in bins.values())
+    estimate = replace(estimate, model=models[int(total.argmax())], n=sum(b.mean_db.size for b in bins))
+    explained = total.max() - sum(b.constant() for b in bins)
     if explained < EVIDENCE_NAT + np.log(len(lags)):  # a smaller gain occurs by chance among so many lags
         return replace(estimate, verdict=CANNOT_TELL, reason=_NO_DEPENDENCE)
     lag_s, held_s = estimate.radio_minus_telemetry_s, _held_s(alive)
@@ -285,16 +283,16 @@ def _held_s(channels: Sequence[ClockChannel]) -> float:
     return float(np.quantile(np.concatenate(old_s), 0.9))
 
 
-def _shown_without(bins: Mapping[str, _Bins], parts: Mapping[str, list[_Parts]], lag_s: float) -> bool:
+def _shown_without(bins: Sequence[_Bins], parts: Sequence[_PartsOf], lag_s: float) -> bool:
     """Check whether a lag remains more likely than zero if any two neighbouring parts of the flight are left out."""
-    start, end = min(b.mean_s[0] for b in bins.values()), max(b.mean_s[-1] for b in bins.values())
+    start, end = min(b.mean_s[0] for b in bins), max(b.mean_s[-1] for b in bins)
     lags = np.array([lag_s, 0.0, *((-_SAME_S, _SAME_S) if abs(lag_s) > _AGREE_S else ())])
     for part in range(_LEFT_OUT - 1):
         nats = []
-        for name, b in bins.items():
+        for b, each in zip(bins, parts, strict=True):
             away = (b.mean_s - start) / max(end - start, 1e-9) * _LEFT_OUT - part
-            nats.append(b.likelihood(lags, parts[name], (away < 0.0) | (away >= 2.0)))
-        shifted, *same = np.sum(nats, axis=0).max(axis=0)
+            nats.append(b.likelihood(lags, each, (away < 0.0) | (away >= 2.0)))
+        shifted, *same = np.concatenate(nats).sum(axis=0).max(axis=0)
         if shifted - max(same) < _WITHOUT_NAT:
             return False
     return True
@@ -365,12 +363,13 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bins:
-    """Means (n,) of a channel's levels, times (s,) of the predictions, and index of the first prediction of each mean.
+    """Means (n, channels) of levels, times (s,) of the predictions, and index of the first prediction of each mean.
 
-    ``features`` of directions are averaged over the same duration about each time. ``levels`` (g, models) are the
-    predictions.
+    ``features`` of directions are averaged over the same duration about each time. ``levels`` (g, channels * models)
+    are the predictions.
     """
 
+    names: Sequence[str]
     mean_db: FloatArray
     mean_s: FloatArray
     at_s: FloatArray
@@ -378,10 +377,6 @@ class _Bins:
     along: Along
     features: FloatArray
     levels: FloatArray
-
-    @property
-    def n(self) -> int:
-        return len(self.mean_s)
 
     @classmethod
     def of(cls, channel: ClockChannel, models: Sequence[str], features: FloatArray, window_s: float) -> _Bins | None:
@@ -411,7 +406,8 @@ class _Bins:
         few = place % np.repeat(-(-count // _PER_BIN), count) == 0
         starts = np.concatenate([[0], np.cumsum(few)])[first]
         return cls(
-            mean_db=_calm(np.add.reduceat(y, first) / count),
+            names=[channel.name],
+            mean_db=_calm(np.add.reduceat(y, first) / count)[:, None],
             mean_s=np.add.reduceat(t, first) / count,
             at_s=t[few],
             first=starts,
@@ -430,38 +426,63 @@ class _Bins:
         return out
 
     def systems(self, lags: FloatArray) -> FloatArray:
-        """Return a table (n, lags, columns) of features (offset, slope, gains) and residuals per model."""
+        """Return a table (n, lags, columns) of features (offset, slope, gains) and residuals per channel and model."""
         count = np.diff(np.append(self.first, len(self.at_s)))[:, None]
         features = self.features.shape[1]
-        out = np.empty((self.n, len(lags), features + self.levels.shape[1]))
+        mean_db = np.repeat(self.mean_db, self.levels.shape[1] // len(self.names), axis=1)
+        out = np.empty((len(mean_db), len(lags), features + self.levels.shape[1]))
         for row, lag in enumerate(lags):
             level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
-            residual = self.mean_db[:, None] - level
+            residual = mean_db - level
             out[:, row, :features] = self._between(self.mean_s - lag, self.features)
             # subtract the mean, which the fitted offset absorbs, because sums of numbers near 0 lose less precision
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 
-    def likelihood(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
-        """Return the log likelihood (models, lags) of the means ``kept`` with the best of ``parts``."""
+    def likelihood(self, lags: FloatArray, parts: _PartsOf, kept: BoolArray | None = None) -> FloatArray:
+        """Return the log likelihood (channels, models, lags) of the means ``kept`` with the best of ``parts``."""
+        each = list(dict.fromkeys(part for channel in parts for part in channel))
+        own = [[each.index(part) for part in channel] for channel in parts]
         blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
-        return np.asarray(np.concatenate([self._tried(block, parts, kept).max(axis=0) for block in blocks]).T)
+        tried = np.concatenate([self._tried(block, each, kept) for block in blocks], axis=1)
+        best = [tried[which, :, channel].max(axis=0).T for channel, which in enumerate(own)]
+        return np.asarray(np.stack(best))
 
-    def fitted(self, lags: FloatArray) -> list[_Parts]:
-        """Return the most likely parts for each model and each of the given lags."""
+    def fitted(self, lags: FloatArray) -> _PartsOf:
+        """Return, for each channel, the most likely parts for each model and each of the given lags."""
         parts = [_Parts(*each) for each in product(_MEMORY_S, _WHITE, _GAIN)]
-        return [parts[at] for at in np.unique(self._tried(lags, parts).argmax(axis=0))]
+        best = self._tried(lags, parts).argmax(axis=0)
+        return [[parts[at] for at in np.unique(best[:, channel])] for channel in range(len(self.names))]
 
     def _tried(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
-        """Return the log likelihood of every combination (parts, lags, models)."""
-        rows = np.ones(self.n, dtype=bool) if kept is None else kept
-        return _likelihood(self.systems(lags)[rows], self.mean_s[rows], self.levels.shape[1], parts)
+        """Return the log likelihood of every combination (parts, lags, channels, models)."""
+        rows = np.ones(len(self.mean_s), dtype=bool) if kept is None else kept
+        nats = _likelihood(self.systems(lags)[rows], self.mean_s[rows], self.levels.shape[1], parts)
+        return nats.reshape(len(parts), len(lags), len(self.names), -1)
 
     def constant(self) -> float:
-        """Return the largest log likelihood of a level that does not depend on position."""
-        columns = np.column_stack([np.ones(self.n), np.zeros(self.n), self.mean_db - self.mean_db.mean()])
+        """Return the largest log likelihood of levels that do not depend on position, added over the channels."""
+        ones = np.ones(len(self.mean_s))
+        columns = np.column_stack([ones, 0.0 * ones, self.mean_db - self.mean_db.mean(axis=0)])
         parts = [_Parts(*memory, 0.0) for memory in product(_MEMORY_S, _WHITE)]
-        return float(_likelihood(columns[:, None], self.mean_s, 1, parts).max())
+        nats = _likelihood(columns[:, None], self.mean_s, len(self.names), parts)
+        return float(nats.max(axis=0).sum())
+
+
+def _joined(single: Sequence[_Bins]) -> list[_Bins]:
+    """Join bins of channels at the same times and place, because their features then need to be whitened only once."""
+    groups: dict[object, list[_Bins]] = {}
+    for b in single:
+        groups.setdefault((b.along.place, b.mean_s.tobytes(), b.at_s.tobytes()), []).append(b)
+    return [
+        replace(
+            group[0],
+            names=[name for b in group for name in b.names],
+            mean_db=np.hstack([b.mean_db for b in group]),
+            levels=np.hstack([b.levels for b in group]),
+        )
+        for group in groups.values()
+    ]
 
 
 def _calm(mean_db: FloatArray) -> FloatArray:

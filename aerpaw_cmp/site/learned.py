@@ -11,11 +11,9 @@ tools), the gain towards both ends at once, and the directions in which a gain i
 from __future__ import annotations
 
 import copy
-import csv
 import gzip
 import hashlib
 import json
-import math
 import re
 import zlib
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -983,7 +981,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
             path=path,
             line=numbered[0][0] if numbered else None,
         )
-    values = np.array([_row(line, number, len(header), path) for number, line in numbered[1:]]).reshape(-1, len(header))
+    values = _values(numbered[1:], len(header), path) if numbered[1:] else np.empty((0, len(header)))
     azimuth, elevation = np.unique(np.round(values[:, 0] % 360.0, 6)), np.unique(np.round(values[:, 1], 6))[::-1]
     _check_grid(azimuth, elevation, len(values), path)
     row = np.argmin(np.abs(elevation[None, :] - values[:, 1:2]), axis=1)
@@ -1002,23 +1000,35 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     return pattern
 
 
+def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:
+    """Return the numbers (n, width) of numbered lines. Raise InputError at the first line that is not a direction."""
+    with suppress(ValueError):
+        values = np.loadtxt([line for _, line in numbered], delimiter=",", comments=None, ndmin=2)
+        if values.shape == (len(numbered), width) and _is_gain(values.T):
+            return values
+    # slower, but this finds the damaged line
+    return np.array([_row(line, number, width, path) for number, line in numbered]).reshape(-1, width)
+
+
+def _is_gain(columns: FloatArray) -> bool:
+    """Check whether the columns (azimuth, elevation, gain and perhaps standard deviation) have possible values."""
+    return bool(np.isfinite(columns).all() and (columns[2] <= HIGHEST_DBI).all() and (columns[3:4] >= 0.0).all())
+
+
 def _row(line: str, number: int, width: int, path: Path) -> list[float]:
     """Return the numbers of a line. Raise InputError if they are not a direction with its gain."""
-    cells = next(csv.reader([line]))
-    try:
+    cells = line.split(",")
+    with suppress(ValueError):
         row = [float(cell) for cell in cells]
-    except ValueError:
-        row = []
-    complete = len(row) == width and all(map(math.isfinite, row))
-    if not complete or row[2] > HIGHEST_DBI or min(row[3:4], default=0.0) < 0.0:
-        raise InputError(
-            f"'{line[:60]}'",
-            expected=f"{width} numbers: angles in degrees, gain in dBi (at most {HIGHEST_DBI:g}), standard deviation",
-            cause="the line was cut off" if len(cells) < width else None,
-            path=path,
-            line=number,
-        )
-    return row
+        if len(row) == width and _is_gain(np.array(row)):
+            return row
+    raise InputError(
+        f"'{line[:60]}'",
+        expected=f"{width} numbers: angles in degrees, gain in dBi (at most {HIGHEST_DBI:g}), standard deviation",
+        cause="the line was cut off" if len(cells) < width else None,
+        path=path,
+        line=number,
+    )
 
 
 def _check_grid(azimuth: FloatArray, elevation: FloatArray, count: int, path: Path) -> None:

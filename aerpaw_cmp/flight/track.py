@@ -234,8 +234,8 @@ class TrackAccount:
             (
                 self.below_ground,
                 "telemetry row",
-                "below the site's ground plane: not compared. origin.takeoff_ground_m, or an elevation model, specifies "
-                "the height of the ground",
+                "below the site's ground plane: not compared. origin.takeoff_ground_m, or an elevation model, "
+                "specifies the height of the ground",
             ),
         )
         usual_m, high_m = self.sparse_error_m

@@ -155,8 +155,8 @@ class MapsData(Made):
 
 # Meaning of the antennas of a layer, for the page and the terminal.
 ANTENNAS = (
-    "MIMO: an array at both ends, fed in phase at the tower, mean level over the elements at the UAV. SISO: one element "
-    "at both ends."
+    "MIMO: an array at both ends, fed in phase at the tower, mean level over the elements at the UAV. SISO: one "
+    "element at both ends."
 )
 
 LEAST = "Lowest coverage: {percent:.1f} % of the positions at {where}"

@@ -123,7 +123,7 @@ def test_a_map_prints_the_coverage_of_one_element_and_of_the_array(
     assert f"{one:.1f} %" in line
     (line,) = (line for line in printed.splitlines() if "T1" in line and "MIMO" in line)
     assert f"{four:.1f} %" in line
-    assert ANTENNAS in printed and ANTENNAS in (place / "map" / "map.html").read_text()
+    assert all(ANTENNAS in text for text in (printed, (place / "map" / "map.html").read_text()))
     away = np.linalg.norm(layers[["east_m", "north_m"]].assign(up=40.0), axis=1)
     free = 30.0 + 20 * np.log10(wavelength_m(2.5e9) / (4 * np.pi * away))
     # the direct path plus or minus one ground reflection

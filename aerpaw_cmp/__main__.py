@@ -123,7 +123,7 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
         return f"{command}: {wording().rstrip('.')}; '{command} --help' lists the options", 2
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("aerpaw_cmp"):
         return f"aerpaw-cmp: the Python package '{error.name}' is not installed; 'make setup' installs everything", 1
-    if isinstance(error, FileNotFoundError) and _is_homeless():
+    if isinstance(error, FileNotFoundError) and _has_no_folder():
         return "aerpaw-cmp: the working folder was removed; expected a folder that exists ('cd' to one)", 2
     if isinstance(error, OSError) and error.errno in _UNUSABLE and error.filename:
         shown = os.fsdecode(error.filename)
@@ -138,7 +138,7 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
     )
 
 
-def _is_homeless() -> bool:
+def _has_no_folder() -> bool:
     try:
         os.getcwd()  # noqa: PTH109  pathlib is not loaded for --help
     except OSError:
@@ -205,7 +205,7 @@ def _interrupted(interrupt: KeyboardInterrupt) -> int:
     from .common.errors import one_line
 
     by = interrupts.last()
-    print(one_line("; ".join([f"aerpaw-cmp: {interrupts.said(by)}", *_notes(interrupt)])), file=sys.stderr)
+    print(one_line("; ".join([f"aerpaw-cmp: {interrupts.cause(by)}", *_notes(interrupt)])), file=sys.stderr)
     return SIGNALLED + by
 
 

@@ -65,7 +65,7 @@ from aerpaw_cmp.jobs.calibrate import (
 from aerpaw_cmp.jobs.calibrate_rank import fit_rank, samples_by_tower
 from aerpaw_cmp.jobs.calibration_files import Calibrated, site_entries
 from aerpaw_cmp.logs.writers import format_power_log, format_vehicle_out
-from aerpaw_cmp.site.learned import folder_of, remember
+from aerpaw_cmp.site.learned import folder_of, store_entry
 
 RECIPES = Path(__file__).parents[1] / "tests" / "field" / "learned"
 TIMEZONE = "America/New_York"
@@ -120,7 +120,7 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     )  # fmt: skip
     calibrated = Calibrated(settings, tuple(flights), (), calibration, ranked, "left out", campaigns)
     for name, made in site_entries(calibrated).items():
-        remember(site, name, *made)
+        store_entry(site, name, *made)
     return site
 
 

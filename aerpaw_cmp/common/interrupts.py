@@ -151,13 +151,13 @@ def _watch(signals: int, ended: threading.Event) -> None:
         if not ended.wait(PATIENCE_S) and not _signalled and signal.getsignal(number[0]) is _note:
             _clear()
             # do not use print, because the blocked thread may hold the lock of the stream
-            os.write(2, f"aerpaw-cmp: {said(number[0])} in a long calculation; its output was not written\n".encode())
+            os.write(2, f"aerpaw-cmp: {cause(number[0])} in a long calculation; its output was not written\n".encode())
             # sys.exit would end only this thread
             os._exit(SIGNALLED + number[0])
     os.close(signals)
 
 
-def said(number: int) -> str:
+def cause(number: int) -> str:
     """Return the message for a process that a signal ended."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 

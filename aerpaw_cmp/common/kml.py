@@ -132,7 +132,7 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
         ) from error
     if any(len(place) < 2 for place in places):
         raise InputError("a coordinate without latitude", expected="longitude,latitude,altitude")
-    return [part for place in places for part in ([place] if len(place) <= 3 else _in_threes(place))]
+    return [part for place in places for part in ([place] if len(place) <= 3 else _triples(place))]
 
 
 # Within an area, longitudes differ by less than this [deg], and so do latitudes. The difference between a longitude and
@@ -140,7 +140,7 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
 _AREA_DEG = 5.0
 
 
-def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
+def _triples(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
     """Return positions from numbers that are separated by commas only."""
     threes = [numbers[i : i + 3] for i in range(0, len(numbers), 3)]
     if len(numbers) % 3 or any(max(column) - min(column) > _AREA_DEG for column in list(zip(*threes, strict=True))[:2]):

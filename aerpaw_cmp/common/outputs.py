@@ -254,10 +254,10 @@ class OutputFile:
             with held():
                 self._place.leave()
                 self._place = None
-                _say_kept(error, self.named)
+                _note_output_state(error, self.named)
 
 
-def _say_kept(error: BaseException | None, named: Path) -> None:
+def _note_output_state(error: BaseException | None, named: Path) -> None:
     """Add a note about the state of the output file to an interrupt."""
     if isinstance(error, KeyboardInterrupt) or (error is not None and interrupted()):
         exists = os.path.lexists(named)
@@ -342,7 +342,7 @@ class OutputFolder:
                 with contextlib.suppress(OSError):
                     place.rmdir()
             if not self._written:
-                _say_kept(error, self.named)
+                _note_output_state(error, self.named)
 
     def _refuse_shape(self) -> None:
         """Raise UsageError if the target cannot be a result folder."""

@@ -129,7 +129,7 @@ class Rows:
 
 
 @dataclass(frozen=True, slots=True)
-class _Apart:
+class _Pairs:
     """The distances between rows (n, m): horizontal, vertical, squared chord of the direction, and time.
 
     ``same`` is 1 for rows of the same flight.
@@ -142,7 +142,7 @@ class _Apart:
     same: FloatArray
 
     @classmethod
-    def of(cls, rows: Rows, columns: Rows) -> _Apart:
+    def of(cls, rows: Rows, columns: Rows) -> _Pairs:
         """Return the distances of ``rows`` (n,) from ``columns`` (m,)."""
         between = rows.position_m[:, None] - columns.position_m
         # (n, m), or (headings, n, m) for targets with several headings
@@ -157,7 +157,7 @@ class _Apart:
         )
 
 
-def _place(model: FieldModel, apart: _Apart) -> FloatArray:
+def _place(model: FieldModel, apart: _Pairs) -> FloatArray:
     """Return the covariance (n, m) of the field over positions.
 
     The covariance is averaged over several headings, which is the covariance of a level with unknown heading.
@@ -169,7 +169,7 @@ def _place(model: FieldModel, apart: _Apart) -> FloatArray:
     return np.asarray(model.place_sd_db**2 * near)
 
 
-def _drift(model: FieldModel, apart: _Apart) -> FloatArray:
+def _drift(model: FieldModel, apart: _Pairs) -> FloatArray:
     return np.asarray(model.drift_sd_db**2 * apart.same * np.exp(-apart.seconds / model.drift_s))
 
 
@@ -188,7 +188,7 @@ def covariance(model: FieldModel, rows: Rows, columns: Rows, parts: Collection[P
     -------
     (n, m)
     """
-    apart = _Apart.of(rows, columns)
+    apart = _Pairs.of(rows, columns)
     out = np.full(apart.same.shape, MEAN_SD_DB**2 if "mean" in parts else 0.0)
     if "place" in parts:
         out += _place(model, apart)
@@ -297,7 +297,7 @@ def fit_field(
     start = start or FieldModel()
     start = dataclasses.replace(start, offset_sd_db=_offset_sd_of(used, start.offset_sd_db))
     names = list(learn)
-    apart = [_Apart.of(rows, rows) for rows, _ in used]
+    apart = [_Pairs.of(rows, rows) for rows, _ in used]
 
     def misfit(logs: FloatArray) -> tuple[float, FloatArray]:
         model = _with(start, names, logs)
@@ -339,7 +339,7 @@ def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], usual_db: float) 
     return offset_sd_db(squares, count, usual_db)
 
 
-def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:
+def _likelihood(model: FieldModel, apart: _Pairs, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:
     """Return the log marginal likelihood, up to a constant, and its gradient in the logarithms of the parameters."""
     place, drift = _place(model, apart), _drift(model, apart)
     factor = Factor.of(_noisy(model, MEAN_SD_DB**2 + place + model.offset_sd_db**2 * apart.same + drift))

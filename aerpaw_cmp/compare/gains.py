@@ -1000,7 +1000,7 @@ LEAST_ODDS = 3.0
 _TURNS_DEG = (90.0, 180.0, 270.0)
 
 # If the log odds for an unknown gain exceed this, the rotated copies are not computed.
-_HOPELESS = 8.0
+_CLEARLY_UNKNOWN = 8.0
 
 # Largest number of means, and shortest averaging time [s], with which a flight is tested.
 _MOST_ROWS, _BIN_S = 700, 4.0
@@ -1148,7 +1148,7 @@ def judged(own: float, of: Callable[[float], float]) -> Evidence:
     """
     learned = of(0.0)
     # skip the three rotated copies if the gain is already clearly worse
-    turned = max(map(of, _TURNS_DEG)) if learned > own - _HOPELESS else math.inf
+    turned = max(map(of, _TURNS_DEG)) if learned > own - _CLEARLY_UNKNOWN else math.inf
     return Evidence(over_own=learned - own, over_turned=learned - turned)
 
 

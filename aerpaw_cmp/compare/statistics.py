@@ -666,7 +666,7 @@ def _notes(values: FloatArray, place_m: Track) -> Iterator[str]:
     if share:
         yield (
             f"The error is not stationary: it is {np.sqrt(ratio):.1f} times larger in {100.0 * share:.0f} % of the "
-            "flight. The interval of the RMSE is widened for that and can still be too narrow."
+            "flight. The interval of the RMSE is therefore wider, but can still be too narrow."
         )
 
 

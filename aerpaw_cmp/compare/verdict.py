@@ -930,7 +930,7 @@ def level_difference(
     LevelDifference
         Change of levels, offset and RMSE, with an interval.
     """
-    moved = _apart(first[1], second[1])
+    moved = _common_differences(first[1], second[1])
     scored_in_both = np.isfinite(first[2]) & np.isfinite(second[2])
     first_error, second_error = first[2][scored_in_both], second[2][scored_in_both]
     return LevelDifference(
@@ -938,7 +938,7 @@ def level_difference(
         channel=channel,
         samples=samples,
         scored=Overlap(first=scored[0], second=scored[1], common=int(scored_in_both.sum())),
-        measured_max_db=_largest(_apart(first[0], second[0])),
+        measured_max_db=_largest(_common_differences(first[0], second[0])),
         simulated_max_db=_largest(moved),
         simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
         offset_db=_changed(*offsets_db),
@@ -948,7 +948,7 @@ def level_difference(
     )
 
 
-def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
+def _common_differences(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the differences at samples that have both values."""
     finite = np.isfinite(first) & np.isfinite(second)
     return np.asarray(second[finite] - first[finite], dtype=np.float64)

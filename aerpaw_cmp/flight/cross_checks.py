@@ -90,11 +90,11 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
             flight.place = flight.place or place
     for file in files:
         if _span_of(file) is None:
-            _home(file, groups).files.append(file)
+            _flight_without_time(file, groups).files.append(file)
     for flight in groups:
         tracks = [file for file in flight.files if _tracks(file)]
         for file in flight.files if tracks else ():
-            if file.path not in flight.unsure and (text := _otherwise(file, tracks[0])):
+            if file.path not in flight.unsure and (text := _name_question(file, tracks[0])):
                 flight.unsure[file.path] = text
     return sorted(groups, key=lambda group: (group.span is None, (group.span or ())[:1]))
 
@@ -104,7 +104,7 @@ _FLIGHT_NUMBER = re.compile(r"(?<![a-z])(flight|flt|sortie|mission)[ _.-]?0*(\d{
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)")
 
 
-def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
+def _name_question(file: IngestedFile, track: IngestedFile) -> str:
     """Return a question if a log's name has another flight number or date than the track, otherwise an empty text."""
     names = ["/".join(Path(item.path).parts[-2:]) for item in (file, track)]
     first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
@@ -179,7 +179,7 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
 
 
 # A log may also belong to another track if its distance is below this factor or this value [m].
-_ALIKE, _ALIKE_M = 2.0, 5.0
+_SIMILAR, _SIMILAR_M = 2.0, 5.0
 
 
 def _called(flight: Flight) -> str:
@@ -188,7 +188,7 @@ def _called(flight: Flight) -> str:
     return f"at {str(flight.span[0].astype('datetime64[m]')).replace('T', ' ')} UTC"
 
 
-def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
+def _flight_without_time(file: IngestedFile, groups: list[Flight]) -> Flight:
     """Return the flight of a file without absolute times, and add it to ``groups`` if it is new."""
     # a log with levels and positions is complete, and its relative times are not related to those of other logs
     alone = Flight([file]).complete
@@ -199,7 +199,7 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
     if by_track:
         # nearest track first
         (near_m, best), *others = sorted(by_track)
-        rivals = [i for away_m, i in others if away_m < max(_ALIKE * near_m, _ALIKE_M)]
+        rivals = [i for away_m, i in others if away_m < max(_SIMILAR * near_m, _SIMILAR_M)]
         if rivals:
             called = " and ".join(_called(known[i]) for i in rivals)
             text = f"its positions are also on the track of the flight {called}: the same flight?"
@@ -247,7 +247,7 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
         texts += [
             f"the file's name has {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is correct?"
             for time, form, slack in _name_starts(file.path)
-            if _apart(time, start, zone, exact=slack == _OF_THE_MINUTE) > slack
+            if _time_difference(time, start, zone, exact=slack == _OF_THE_MINUTE) > slack
         ]
         if any(s.attributes.get("clock_from") == "assumed" for s in streams):
             texts.append(f"the times are read as {_source(streams, 'clock') or 'local wall time'}: correct?")
@@ -308,7 +308,7 @@ def doubts(
         if (without := float(np.mean(~track.pose_at(time).valid))) > _MANY_WITHOUT_POSE:
             poseless[name] = without
     texts = [
-        f"{_listed(names)} begins {hours:+d} h from the telemetry, probably because of a wrong time zone"
+        f"{_listed(names)} begins {hours:+d} h relative to the telemetry, probably due to a wrong time zone"
         for hours, names in apart.items()
     ]
     if poseless:
@@ -424,7 +424,7 @@ def _name_starts(path: str) -> list[tuple[datetime, str, timedelta]]:
     return starts
 
 
-def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
+def _time_difference(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
     """Return the difference between a time and the start of a flight.
 
     If the zone of the time is unknown, the zone that fits best is used.

@@ -57,7 +57,7 @@ _NOT_COVERED = (
 
 
 def audit_replays(
-    data: FlightData, replays: Sequence[Replayed], progress: Progress = logged, *, anew: bool = True
+    data: FlightData, replays: Sequence[Replayed], progress: Progress = logged, *, fresh: bool = True
 ) -> EngineResult:
     """Return the engine record, with an audit if ``rt.audit_links`` is above 0.
 
@@ -67,7 +67,7 @@ def audit_replays(
     replays : sequence of Replayed
         Replays of the RSS series of the flight, then of its rank series.
     progress : Progress
-    anew : bool
+    fresh : bool
         True to ignore the cached audit.
 
     Returns
@@ -77,7 +77,7 @@ def audit_replays(
     rt, checked, not_audited = data.settings.rt, None, ""
     if rt.audit_links:
         try:
-            checked = _audit_or_read(data, replays, progress, anew=anew)
+            checked = _audit_or_read(data, replays, progress, fresh=fresh)
         except SionnaMissingError as error:  # all other numbers are the same without Sionna
             if rt.engine == "sionna":
                 raise
@@ -100,11 +100,11 @@ def audit_replays(
 
 
 def _audit_or_read(
-    data: FlightData, replays: Sequence[Replayed], progress: Progress, *, anew: bool
+    data: FlightData, replays: Sequence[Replayed], progress: Progress, *, fresh: bool
 ) -> AuditResult | None:
-    """Return the audit from the cache, else compute it. ``anew`` ignores the cache."""
+    """Return the audit from the cache, else compute it. ``fresh`` ignores the cache."""
     store, key = OutcomeStore(cache_folder("audits"), AuditResult), _content_of(data, replays)
-    known: AuditResult | None = None if anew else store.load(key)
+    known: AuditResult | None = None if fresh else store.load(key)
     if known is None and (made := _audit(data, replays, progress)) is not None:
         store.save(key, dataclasses.replace(made, read_from_cache_of=utc_now()[:10]))
         return made

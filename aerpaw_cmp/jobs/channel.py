@@ -29,7 +29,7 @@ from ..propagation.replay import check_band, subcarriers_hz
 from ..report.channel import STREAMED, Along, Channel, chosen_formats, write_channel
 from ..site.learned import BAND
 from .options import DEFAULT, JobOutcome, RunOptions
-from .sources import Source, TargetOptions, find_targets, memory_of, target_files
+from .sources import Source, TargetOptions, find_targets, stored_model, target_files
 from .tasks import inputs_of_flight
 
 _MOST_POSES = 10_000_000
@@ -273,19 +273,19 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
 def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> Callable[[Poses], dict[str, Any]]:
     """Return a function for the calibrated levels at poses, with the learned antennas of the site if there are any."""
     towers, sources = tuple(link.tower_arrays), dict[str, Source]()
-    memory = memory_of(data.site_place, data.site)
-    if memory is None:
+    stored = stored_model(data.site_place, data.site)
+    if stored is None:
         remarks.append("No calibrated level: no antennas were learned for this site (aerpaw-cmp calibrate).")
         return lambda _: {}
     # try the antennas of the link's channel first (False sorts before True), then antennas of other channels
-    for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
+    for source in sorted(stored.sources().values(), key=lambda s: s.channel != name):
         near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
         if source.tower in towers and near and source.tower not in data.nodes:
             sources.setdefault(source.tower, source)
     if not sources:
         remarks.append("No calibrated level: the site has no learned antennas of these towers near this carrier.")
         return lambda _: {}
-    known = [memory.known[source.antenna] for source in sources.values()]
+    known = [stored.known[source.antenna] for source in sources.values()]
     trained_on = union(*(antenna.entry.trained_on for antenna in known))
     if is_training_data(data, trained_on, union(*(end.marks for of in known for end in (of.tower, of.uav)))):
         remarks.append("The calibrated level was also learned from this flight's logs, so it is not a prediction.")
@@ -296,9 +296,9 @@ def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> C
         level, sd = np.full((2, len(poses), len(towers)), np.nan)
         heading, up = bearing_deg(poses.rotation[:, :, 0]), poses.rotation[:, :, 2]
         for tower, source in sources.items():
-            gain, slow, _ = memory.levels([source.targets(poses.position_m, heading, up)])
+            gain, slow, _ = stored.levels([source.targets(poses.position_m, heading, up)])
             level[:, towers.index(tower)] = gain + source.free_space_db(poses.position_m)
-            sd[:, towers.index(tower)] = memory.fading(source.antenna).total_db(slow)
+            sd[:, towers.index(tower)] = stored.fading(source.antenna).total_db(slow)
         return {"level_db": level, "level_sd_db": sd, "level_unit": units, "trained_on": trained_on}
 
     return levels

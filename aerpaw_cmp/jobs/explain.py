@@ -262,7 +262,7 @@ def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
 
 def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
     traced = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
-    otherwise = "the geometry allows it, but terrain blocks it, or it is on the ground of another tower"
+    otherwise = "possible by geometry, but blocked by terrain, or on the ground of another tower"
     if replayed.engine == "sionna":  # with too few rays, Sionna misses paths
         otherwise = f"not blocked, but not found with {replayed.samples} samples per tower"
     for words, sequence in simple_paths(replayed):

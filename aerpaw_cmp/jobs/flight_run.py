@@ -578,7 +578,7 @@ def run_flight(
     *,
     replays: FlightReplay | None = None,
     audit: bool = True,
-    anew: bool = False,
+    fresh: bool = False,
     ladder: bool = False,
 ) -> FlightRun:
     """Run clocks, replay, comparison, audit and model comparison.
@@ -592,7 +592,7 @@ def run_flight(
         Existing replays of this flight (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
     audit : bool
         Also fill ``result.engine``, with an audit by the other engine if ``rt.audit_links`` is above 0.
-    anew : bool
+    fresh : bool
         Ignore the cached audit.
     ladder : bool
         Also score simpler and richer models of the RSS on held-out segments.
@@ -608,7 +608,7 @@ def run_flight(
         result = compare_flight(data, replays)
     if audit:
         with stages("audit"):
-            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, anew=anew))
+            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, fresh=fresh))
     comparison: FlightComparison | None = None
     if ladder:
         with stages("models"):

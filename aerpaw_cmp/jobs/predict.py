@@ -44,20 +44,20 @@ from .options import DEFAULT, RANKS, JobOutcome, RunOptions
 from .sources import (
     PRIOR_SD_DB,
     Flown,
-    Memory,
     NamedFlight,
     Prior,
     Source,
+    Stored,
     TargetOptions,
     Targets,
     files_of,
     find_targets,
     is_settings,
-    memory_of,
     named_flights,
     outside,
     outside_area,
     sources_of,
+    stored_model,
     target_files,
     track_m,
 )
@@ -91,7 +91,7 @@ class Prediction:
 
     page: pages.PredictionPage
     targets: Targets
-    model: Flown | Memory | Prior
+    model: Flown | Stored | Prior
     sources: Mapping[str, Source]
 
     @property
@@ -177,7 +177,7 @@ def predict(
 
 
 def _model_fields(
-    model: Flown | Memory | Prior, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
+    model: Flown | Stored | Prior, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
 ) -> dict[str, Any]:
     """Return the fields of the page about the model and its training data."""
     guess = pages.outside_share(table)
@@ -197,15 +197,15 @@ def _model_fields(
         fields["chosen"] = {"title": pages.TITLES[base], "base": base, "corrected": False, "field": OFF}
     if isinstance(model, Prior):
         origin = pages.prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
-        verdict = pages.first_words(None, 0.0, *expected, origin=origin)
+        verdict = pages.first_sentences(None, 0.0, *expected, origin=origin)
         off = outside_area(table[["east_m", "north_m"]].to_numpy(np.float64), model.site).mean()
         return fields | {"verdict": verdict, "warnings": pages.prior_cautions(PRIOR_SD_DB, float(off))}
-    if isinstance(model, Memory):
+    if isinstance(model, Stored):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return fields | {
-            "verdict": pages.first_words(None, guess, *expected),
+            "verdict": pages.first_sentences(None, guess, *expected),
             "warnings": [pages.OUTSIDE["remembered"].format(percent=100.0 * guess)] if guess > pages.MANY else [],
-            "notes": pages.memory_notes([(m.entry, m.series) for m in model.known.values()]),
+            "notes": pages.stored_model_notes([(m.entry, m.series) for m in model.known.values()]),
             "flights": [name for entry in entries for name in entry.flights],
             KEY: union(*(entry.trained_on for entry in entries), *logs),
             MARKS: union(*(end.marks for m in model.known.values() for end in (m.tower, m.uav)), *marks),
@@ -213,7 +213,7 @@ def _model_fields(
     correction = model.correction
     key = correction.base, correction.title
     return fields | {
-        "verdict": pages.first_words(correction, guess, *expected),
+        "verdict": pages.first_sentences(correction, guess, *expected),
         "warnings": pages.cautions(correction, guess),
         "notes": pages.notes(correction),
         KEY: union(*map(flight_logs, known), *logs, *model.trained_on),
@@ -289,15 +289,15 @@ def site_of(
     return site, place
 
 
-def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions) -> Memory | Prior:
+def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions) -> Stored | Prior:
     """Return the model of a site without named flights: the levels learned for it, else ray tracing with a prior.
 
     The prior is used if the user names a carrier or a power, because learned levels include their own carrier and
     power.
     """
-    memory = memory_of(place, site) if options.carrier_hz is None and options.tx_power_dbm is None else None
-    if memory is not None:
-        return memory
+    stored = stored_model(place, site) if options.carrier_hz is None and options.tx_power_dbm is None else None
+    if stored is not None:
+        return stored
     stated, flight = site_model(place).coverage, flight_of(where)
     link = LinksSettings().rank if flight is None else flight.link.rss
     carrier_hz = options.carrier_hz or (stated.carrier_ghz or 0.0) * 1e9 or link.carrier_hz
@@ -373,16 +373,16 @@ def _bases(
     }
     links = [(s.link.build([s.tower], s.folder), s.folder) for s in sources.values()]
     near = {
-        name: memory
-        for name, memory in latest_learned_links(place).items()
-        if name in sources and abs(memory.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
+        name: stored
+        for name, stored in latest_learned_links(place).items()
+        if name in sources and abs(stored.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
     }
     learned: dict[str, list[MeasuredPattern | FlightFile]] = {
         "replay": [
             *(p for link, folder in links for p in learned_patterns(link, folder, place)),
             *(data.settings for data in known),
         ],
-        "memory": [end for memory in near.values() for end in (memory.tower, memory.uav)],
+        "memory": [end for stored in near.values() for end in (stored.tower, stored.uav)],
     }
     if not any(knows(data, learned["replay"]) for data in known):
         bases["replay"] = each(lambda source, s: source.replayed_db(s))
@@ -399,7 +399,7 @@ def _bases(
 def _table(
     targets: Targets,
     site: Site,
-    learned: tuple[Mapping[str, Source], Flown | Memory | Prior, Receivers],
+    learned: tuple[Mapping[str, Source], Flown | Stored | Prior, Receivers],
     progress: Progress,
 ) -> pd.DataFrame:
     """Return the table of a prediction: rows for every tower and channel, then rows for every receiver of ranks.
@@ -453,9 +453,9 @@ def _table(
     return table
 
 
-def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
+def _stated(model: Flown | Stored | Prior, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
     """Return the columns (n,) of a level: median, SD, interval, and P(lock) if the receiver can lose its lock."""
-    lock = model.lost_lock(antenna, level_db) if isinstance(model, Memory) else None
+    lock = model.lost_lock(antenna, level_db) if isinstance(model, Stored) else None
     if lock is None:
         fading = model.fading(antenna)
         half, sd = fading.half_width_db(slow_db, BAND), fading.total_db(slow_db)
@@ -470,7 +470,7 @@ def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slo
 
 
 def _levels(
-    targets: Targets, sources: Mapping[str, Source], model: Flown | Memory | Prior, progress: Progress
+    targets: Targets, sources: Mapping[str, Source], model: Flown | Stored | Prior, progress: Progress
 ) -> tuple[AnyArray, AnyArray, BoolArray]:
     """Return level, standard deviation of 4 s means (series, n) [dB], and True where the model extrapolates.
 

@@ -255,7 +255,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             check_recommended(data)
         stages.checked(lambda: report_stages(data, chosen.figures))
         replays = replay_flight(data, stages)
-        flight_run = run_flight(data, stages, replays=replays, anew=chosen.audit is not None, ladder=True)
+        flight_run = run_flight(data, stages, replays=replays, fresh=chosen.audit is not None, ladder=True)
         carriers = {replayed.link.carrier_hz for replayed in replays.all}
         record = report_data(
             data,
@@ -384,7 +384,7 @@ def run_site_import(
         One line per action.
     """
     from ..site.footprints import import_site, site_yaml
-    from ..site.learned import carry_memory
+    from ..site.learned import copy_learned
 
     inputs = [*files, *(Path(name) for name in (base, options.get("dem")) if name is not None)]
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
@@ -392,7 +392,7 @@ def run_site_import(
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
     # do not copy learned antennas if towers are named, because the antennas belong to the towers of the base site
-    return [*actions, *([] if towers else carry_memory(base or "lake_wheeler", out))]
+    return [*actions, *([] if towers else copy_learned(base or "lake_wheeler", out))]
 
 
 def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
@@ -589,17 +589,17 @@ def run_calibrate(
     JobOutcome
         The settings file is the first of its ``files``.
     """
-    from ..site.learned import folder_of, mend_remark, remember
+    from ..site.learned import damage_remark, folder_of, store_entry
     from ..site.siteyaml import inputs_of_site, site_model
     from .calibrate import calibrate, load_calibration, read_flights
     from .calibrate_rank import fit_rank, samples_by_tower
     from .calibration_files import Calibrated, site_entries, write_files
     from .tasks import inputs_of_flights
 
-    settings, mended = load_calibration(path, further), list[str]()
+    settings, damaged = load_calibration(path, further), list[str]()
     if into_site is not None:
         site_model(into_site)  # report a misspelt site before the fit, so that nothing is stored under its name
-        mended = mend_remark(folder_of(into_site), settings.by_campaign())  # refuse an index of another version
+        damaged = damage_remark(folder_of(into_site), settings.by_campaign())  # refuse an index of another version
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is not a YAML file", expected="-o NAME.yaml", path=target)
@@ -613,7 +613,7 @@ def run_calibrate(
     ):
         with stages("read"):
             flights, remarks, campaigns = read_flights(settings, path.parent, options.logs_root)
-            remarks += mended
+            remarks += damaged
             reports = samples_by_tower(flights) if settings.rank else {}
         ranked, calibration = None, None
         if not settings.rank or any(data.rss for data in flights):
@@ -633,5 +633,5 @@ def run_calibrate(
         file.write(sealed(text))
     if into_site is not None:
         entries = site_entries(calibrated)
-        metrics["into_site"] = [str(f) for name, made in entries.items() for f in remember(into_site, name, *made)]
+        metrics["into_site"] = [str(f) for name, made in entries.items() for f in store_entry(into_site, name, *made)]
     return JobOutcome(folder=folder, metrics=metrics, files=(target,))

@@ -247,7 +247,7 @@ def _grid(site: Site, options: TargetOptions) -> Targets:
 def _planned(flight: FlightFile, site: Site) -> Targets:
     assert flight.flight.plan is not None
     time, position, yaw = planned_poses(flight.flight.plan, site.takeoff_ground_m, 1.0)
-    up, name = _leaning(position, time), flight.flight.name
+    up, name = _tilted_axes(position, time), flight.flight.name
     return Targets(
         kind="route", name=name, position_m=position, yaw_deg=yaw % 360.0, time_s=time, up=up, towers=_named(flight)
     )
@@ -257,7 +257,7 @@ def _named(flight: FlightFile) -> frozenset[str]:
     return frozenset(name for log in flight.logs for name in (log.node, *log.cells.values()) if name)
 
 
-def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
+def _tilted_axes(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
     """Return the upward axes (n, 3) of a multicopter, which leans into its motion."""
     time = np.maximum.accumulate(time_s)
     # use positions two seconds apart, because logged positions are rounded, and an aircraft does not change its lean
@@ -376,7 +376,7 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
         yaw, time = yaw[leg], at / SPEED_MPS
         if count > 1:
             remarks += (f"The points are {STEP_M:g} m apart, and the times assume a speed of {SPEED_MPS:g} m/s.",)
-    up = _leaning(position, time)
+    up = _tilted_axes(position, time)
     return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, up=up, remarks=remarks)
 
 
@@ -555,7 +555,7 @@ class Flown:
         return float(np.nanmean([np.nanmean(b.residual_db - source.replayed_db(b)) for b in binned]))
 
 
-class Memory:
+class Stored:
     """The model that is stored for the site: learned antennas and level of each channel.
 
     Parameters
@@ -574,11 +574,11 @@ class Memory:
 
         The model extrapolates outside the site, and in directions with few training samples.
         """
-        memory = self.known[each[0].antenna]
+        stored = self.known[each[0].antenna]
         gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
-        level, spread, gain_variance = memory.level, memory.spread, (sds**2).mean(axis=0)
+        level, spread, gain_variance = stored.level, stored.spread, (sds**2).mean(axis=0)
         variance_db2 = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
-        guess = outside_area(each[0].position_m, self._site) | (gain_variance > 0.5 * memory.prior_variance_db2)
+        guess = outside_area(each[0].position_m, self._site) | (gain_variance > 0.5 * stored.prior_variance_db2)
         return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + variance_db2), guess
 
     def fading(self, antenna: str) -> Spread:
@@ -587,8 +587,8 @@ class Memory:
 
     def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:
         """Return the forecast of a receiver that loses its lock, about levels in lock (n,) [dB]."""
-        memory = self.known[antenna]
-        lock, level = memory.series.lock, memory.level
+        stored = self.known[antenna]
+        lock, level = stored.series.lock, stored.level
         if lock is None:
             return None
         above_db = level_db - level.offset_db - level.transmit_power_dbm - lock.gain_db
@@ -603,8 +603,8 @@ class Memory:
     def sources(self) -> dict[str, Source]:
         """Return one link per learned antenna. Both ends are isotropic, because the model adds the learned gains."""
         out = {}
-        for antenna, memory in self.known.items():
-            series, level = memory.series, memory.level
+        for antenna, stored in self.known.items():
+            series, level = stored.series, stored.level
             link = LinkSettings(carrier_hz=series.carrier_hz, transmit_power_dbm=level.transmit_power_dbm)
             out[antenna] = Source(
                 tower=series.tower, channel=series.channel, unit=level.unit, link=link, site=self._site,
@@ -613,11 +613,11 @@ class Memory:
         return out
 
 
-def memory_of(place: str | Path, site: Site) -> Memory | None:
+def stored_model(place: str | Path, site: Site) -> Stored | None:
     """Return the model of the antennas and levels learned for a site. None if no level of its towers was learned."""
     learned = latest_learned_links(place)
     known = {name: m for name, m in learned.items() if m.series.level and m.series.tower in site.towers}
-    return Memory(known, site) if known else None
+    return Stored(known, site) if known else None
 
 
 # Standard deviations of a prediction before any flight [dB]. Offset: transmit power, cables and receiver gain, all

@@ -132,7 +132,7 @@ class TapLog:
         # use a counter for each of the two threads: with a common counter, counts could be lost
         self._dropped = self._refused = 0
         self._fault_since_ns = self._fault_lost = self._retry_ns = 0
-        self._stem, self._fd, self._size, self._torn, self._dirty = "", -1, 0, False, False
+        self._stem, self._fd, self._size, self._truncated, self._dirty = "", -1, 0, False, False
         self._opened_ns = self._synced_ns = 0
         self._thread = threading.Thread(target=self._run, name="tap-log", daemon=True)
 
@@ -271,17 +271,17 @@ class TapLog:
         record["n"] = self.records + self.lost
         line = encode_record(record)
         # if a truncated line could not be removed, end it here, so that the checksum refuses only that line
-        data = b"\n" + line if self._torn else line
+        data = b"\n" + line if self._truncated else line
         written = os.write(self._fd, data)
         # if the disk became full within the line, remove the truncated line from the file
         if written < len(data):
             try:
                 os.ftruncate(self._fd, self._size)
             except OSError:
-                self._torn = True
+                self._truncated = True
                 self._size += written
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self._torn = False
+        self._truncated = False
         self._size += written
         self.bytes_written += written
         self.records += 1
@@ -318,7 +318,7 @@ class TapLog:
         path = self._folder / f"{self._stem}_{len(self.paths) + 1:04d}.jsonl"
         # O_EXCL: never write into the segment of another session
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
-        self._size, self._torn = 0, False
+        self._size, self._truncated = 0, False
         try:
             self._put({**self._header(), "segment": len(self.paths) + 1})
             os.fdatasync(self._fd)

@@ -130,7 +130,7 @@ class RunningInterval:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class Query:
     """A request for the prediction at an answer of the modem, with the times of answer and command and the values."""
 
     utc_ns: int
@@ -150,16 +150,16 @@ class PredictionWorker:
     def __init__(self, predict: Predict) -> None:
         self._predict = predict
         # only one request may wait, because a prediction for an earlier time would be too late for the pilot
-        self._wanted: queue.Queue[Asked | None] = queue.Queue(maxsize=1)
+        self._wanted: queue.Queue[Query | None] = queue.Queue(maxsize=1)
         self._done: deque[dict[str, Any]] = deque(maxlen=1000)
         self._rank, self._level = RunningInterval(), RunningInterval()
         self._thread = threading.Thread(target=self._run, name="tap-prediction", daemon=True)
         self._thread.start()
 
-    def ask(self, asked: Asked) -> None:
+    def ask(self, request: Query) -> None:
         """Request the prediction for an answer, unless another request is waiting."""
         with contextlib.suppress(queue.Full):
-            self._wanted.put_nowait(asked)
+            self._wanted.put_nowait(request)
 
     def results(self) -> list[dict[str, Any]]:
         """Return finished predictions, each with measured rank and residual (measured minus predicted)."""
@@ -174,22 +174,22 @@ class PredictionWorker:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        while (asked := self._wanted.get()) is not None:
+        while (request := self._wanted.get()) is not None:
             result: dict[str, Any] = {
-                "for_sent_utc_ns": asked.sent_utc_ns,
-                "at_utc_ns": asked.utc_ns,
-                "measured": asked.rank,
+                "for_sent_utc_ns": request.sent_utc_ns,
+                "at_utc_ns": request.utc_ns,
+                "measured": request.rank,
                 "predicted": None,
             }
             try:
-                prediction = self._predict(asked.utc_ns)
+                prediction = self._predict(request.utc_ns)
                 if prediction is not None:
-                    result |= self._compared(asked, prediction)
+                    result |= self._compared(request, prediction)
             except Exception as error:  # an error of the replay must not end the log
                 result["error"] = f"{type(error).__name__}: {error}"[:300]
             self._done.append(result)
 
-    def _compared(self, asked: Asked, now: Prediction) -> dict[str, Any]:
+    def _compared(self, request: Query, now: Prediction) -> dict[str, Any]:
         """Return prediction, interval and residual for the record. The measurement affects only later intervals."""
         places = ("east_m", "north_m", "up_m", "fix", "telemetry_age_s", "telemetry_delay_s")
         fields: dict[str, Any] = {"predicted": now.rank}
@@ -198,16 +198,16 @@ class PredictionWorker:
             if (bounds := self._rank.bounds()) is not None:
                 low, high = (min(max(now.rank + round(bound), RANKS[0]), RANKS[1]) for bound in bounds)
                 fields["rank_interval"] = [low, high]
-            if asked.rank is not None:
-                fields["residual"] = asked.rank - now.rank
+            if request.rank is not None:
+                fields["residual"] = request.rank - now.rank
                 self._rank.add(fields["residual"])
         if now.level_dbm is not None and math.isfinite(now.level_dbm):
-            fields |= {"level_dbm": _rounded(now.level_dbm), "rsrp_dbm": asked.rsrp_dbm}
+            fields |= {"level_dbm": _rounded(now.level_dbm), "rsrp_dbm": request.rsrp_dbm}
             fields["offset_db"] = _rounded(self._level.middle)
             if (bounds := self._level.bounds()) is not None:
                 fields["level_interval_dbm"] = [_rounded(now.level_dbm + bound) for bound in bounds]
-            if asked.rsrp_dbm is not None:
-                self._level.add(asked.rsrp_dbm - now.level_dbm)
+            if request.rsrp_dbm is not None:
+                self._level.add(request.rsrp_dbm - now.level_dbm)
         fields["inside"] = [self._rank.inside, self._rank.given, self._level.inside, self._level.given]
         return fields
 

@@ -23,7 +23,7 @@ from ..common.versions import tool_version
 from ..logs.files import SCHEMA, Record
 from . import modem, ports
 from .log import Clock, TapLog, boot_id, clock_synchronised
-from .predict import Asked, Predict, PredictionWorker
+from .predict import Predict, PredictionWorker, Query
 
 # A jump of the wall clock relative to the monotonic clock is recorded if it exceeds this.
 _CLOCK_STEP_NS = 50_000_000
@@ -517,7 +517,7 @@ class Tap:
                     # use the pose at the middle of the exchange, because it is unknown when the modem determined the
                     # rank
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
-                    self._worker.ask(Asked(middle, record["sent_utc_ns"], decoded.get("rank"), self._last["rsrp_dbm"]))
+                    self._worker.ask(Query(middle, record["sent_utc_ns"], decoded.get("rank"), self._last["rsrp_dbm"]))
             elif status in ("error", "cme"):
                 code = record.get("code", "")
                 said = f"+CME ERROR: {code}" if status == "cme" else "ERROR"

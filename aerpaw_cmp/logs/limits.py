@@ -84,7 +84,7 @@ def jumps_of(frame: pd.DataFrame, what: str = "") -> tuple[BoolArray, str]:
             f"{what}: its positions imply {speed_mps:.0f} m/s throughout: are its times in another unit"
             f"{units and f' ({units})'}? If so, write it into the name of their column, such as 'time [min]'"
         )
-    astray, at_rest, fast_mps, at = _astray(time_s, place_m)
+    astray, at_rest, fast_mps, at = _off_track(time_s, place_m)
     if not astray.any() and speed_mps <= FASTEST_MPS:
         return none, ""
     if speed_mps > FASTEST_MPS or float((astray & ~at_rest).mean()) > _FEW_JUMPS_SHARE:
@@ -226,7 +226,7 @@ def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
     return len(apart_m) > 1 and min(apart_m[1:]) < _STEP_BACK_SHARE * apart_m[0]
 
 
-def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArray, float, int]:
+def _off_track(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArray, float, int]:
     """Return masks (n,) of rows off the track and of rows at rest at an end, and speed and row of the first jump.
 
     Rows between two fast steps form a run. The longest run that moves is the track. A run that the track cannot reach
@@ -360,7 +360,7 @@ class _Check:
             self._all_silent()
             self._lost_readings()
             self._two_levels()
-        self._at_a_site_if_otherwise()
+        self._check_exchanged_angles()
         for flag, check_of in ((STALE, stale_of), (FLAG, jumps_of)):
             bad, sentence = check_of(self.frame, self._what)
             if bad.any():
@@ -400,7 +400,7 @@ class _Check:
                 hint = "; are latitude and longitude swapped?"
         self._flag(bad, flag, first, f"where {low:g} .. {high:g} can be{hint}", names)
 
-    def _at_a_site_if_otherwise(self) -> None:
+    def _check_exchanged_angles(self) -> None:
         """Report positions that would be at a site of AERPAW if angles were swapped or had another sign or unit."""
         if not {*PLACE[:2]} <= set(self.frame.columns):
             return

@@ -273,12 +273,12 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     raise InputError(
         "binary content that no reader recognises" if binary else f"no reader recognises this content: {shown}",
         expected="one of the formats of 'aerpaw-cmp formats'",
-        cause="another kind of file, or a damaged one" if binary else _way_out(head),
+        cause="another kind of file, or a damaged one" if binary else _advice(head),
         path=path,
     )
 
 
-def _way_out(head: bytes) -> str:
+def _advice(head: bytes) -> str:
     lines = [decoded(line).strip() for line in head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n")[:30]]
     # take the most frequent sign as the separator, because decimal commas are rarer
     sign = max(",;\t|", key="".join(lines).count)
@@ -294,7 +294,7 @@ def _way_out(head: bytes) -> str:
             return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or not a table"
         if "\ufffd" in first:
             return "text in another encoding than UTF-8: save the table as UTF-8"
-        return _way_to_map(names, rows[at + 1 :])
+        return _mapping_advice(names, rows[at + 1 :])
     words = re.split(r"[,;\s|]+", first)
     if len(words) > 1 and (re.fullmatch(r"[-+.\d]+", words[0] + words[-1]) or "time" in words):
         return "a table without names or commas: write a line such as 'time,rss_db' above it, commas between its cells"
@@ -305,7 +305,7 @@ _NUMBER = re.compile(r'[ "]*[-+]?\d')
 _NEGATIVE = re.compile(r'[ "]*-\d{1,3}(\.\d*)?[ "]*')
 
 
-def _way_to_map(names: list[str], rows: Sequence[Sequence[str]]) -> str:
+def _mapping_advice(names: list[str], rows: Sequence[Sequence[str]]) -> str:
     """Return the options that read an unknown table, if its names or cells may contain a track or a level."""
     from . import dictionary
 

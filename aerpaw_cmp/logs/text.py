@@ -301,7 +301,7 @@ class Count(NamedTuple):
 
     name: str
     ns: float
-    said: re.Pattern[str]
+    word: re.Pattern[str]
     least_epoch: float
 
 

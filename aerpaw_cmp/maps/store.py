@@ -171,8 +171,8 @@ class Reach:
     def of(self, box_m: FloatArray) -> Site:
         """Return the site with the towers and buildings that reach a box (lowest and highest corner, 3)."""
         every, reach = self.site.towers.items(), self._reach_m
-        towers = {name: tower for name, tower in every if np.linalg.norm(_apart(tower, box_m)) <= reach}
-        if not any(_apart(tower, box_m).max() <= REACH_M for tower in towers.values()):
+        towers = {name: tower for name, tower in every if np.linalg.norm(_box_distances(tower, box_m)) <= reach}
+        if not any(_box_distances(tower, box_m).max() <= REACH_M for tower in towers.values()):
             towers = {}
         if self._every:
             return replace(self.site, towers=towers)
@@ -201,7 +201,7 @@ class Reach:
         return near
 
 
-def _apart(tower: Tower, box_m: FloatArray) -> FloatArray:
+def _box_distances(tower: Tower, box_m: FloatArray) -> FloatArray:
     """Return the distances (2,) from a tower to the nearest point of a box, east and north."""
     at = tower.position_m[:2]
     return np.maximum(np.maximum(box_m[0, :2] - at, at - box_m[1, :2]), 0.0)

@@ -144,11 +144,11 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
         finally:
             config.CACHE_DIR = before
         # replace the cache that numba created, because it would unpickle any file in the folder
-        compiled._cache._cache_file = _Sealed(function, folder)
+        compiled._cache._cache_file = _CheckedCache(function, folder)
     return compiled
 
 
-class _Sealed:
+class _CheckedCache:
     """The compiled code of one kernel on disk.
 
     Each entry ends with its SHA-256, because damaged machine code can crash the process. A damaged entry is ignored,

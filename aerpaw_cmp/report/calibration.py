@@ -15,7 +15,7 @@ from ..common.units import FloatArray
 from ..compare.calibration import BASELINES, Score, mean_rmse
 from ..compare.verdict import Verdict, antenna_or_place, by_flight
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, write_page
-from .flight_words import said_of
+from .flight_words import sentence_of
 from .page import Made, about
 from .places import BODY, COMPASS, Places, payload
 from .texts import minute, number, percent
@@ -149,13 +149,13 @@ def sentences(scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequ
     verdict, turned = helps(left_out), frame(controls)
     worst = max(left_out, key=lambda score: score.rmse_db)
     ends = sorted(map(abs, turned.interval))
-    helped, _, step = said_of(verdict, HELPS).partition(" Next: ")
+    helped, _, step = sentence_of(verdict, HELPS).partition(" Next: ")
     first = (
         f"Held-out flights: RMSE {mean_rmse(left_out):.1f} dB with learned antennas; "
         f"{BASELINES[verdict.where]}: {mean_rmse(left_out, verdict.where):.1f} dB.",
         helped,
         f"Largest error: {worst.flight}, {worst.tower} {worst.channel}, {worst.rmse_db:.1f} dB.",
-        said_of(turned, FRAMES, near=ends[0], far=ends[1]),
+        sentence_of(turned, FRAMES, near=ends[0], far=ends[1]),
         f"Next: {step}" if turned.cause != "place" else "",
     )
     return (" ".join(text for text in first if text), *_further(scores))
@@ -283,8 +283,8 @@ def rank_card(data: CalibrationData) -> Card:
     """Return the card of the rank receiver's forecasts on held-out flights."""
     table = Table(
         caption="The receiver is fitted on the other flights. Log score in nats per report, lower is better. The "
-        "constant forecast has the rank shares of the training flights. Total variation is that of the expected "
-        "histogram.",
+        "constant forecast has the rank shares of the training flights. The total variation compares the expected and "
+        "the measured histogram.",
         columns={"Held out": TEXT, "Flight": HEAD, "Tower": TEXT, "kappa": 2, "log score": 3, "constant": 3,
                  "total variation": 3, "agreement": SHARE, "most frequent rank": SHARE},
         rows=_rows(data.rank, ("flight", "tower", "kappa", "log_score", "constant_log_score",

@@ -24,7 +24,7 @@ from ..site.site import Site
 from .canvas import mark
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, settings_card
 from .charts import Chart
-from .flight_words import RANK_WORDS, first_sentence, pretty, ranking_sentence, said_of, signed
+from .flight_words import RANK_WORDS, first_sentence, pretty, ranking_sentence, sentence_of, signed
 from .page import Made, about, json_text, write_file
 from .places import RESIDUAL, Places, payload
 from .texts import k_key, minute, more, number
@@ -417,7 +417,7 @@ def verdict(data: CampaignData) -> list[str]:
             f"of the other flights. Expect {np.mean(held_out):.1f} dB on a new flight."
         )
     flight, error, link = by_error(rows)[0]
-    return [*out, said_of(cause(data), CAUSES, flight=flight, error=error, link=link)]
+    return [*out, sentence_of(cause(data), CAUSES, flight=flight, error=error, link=link)]
 
 
 def cause(data: CampaignData) -> Verdict:

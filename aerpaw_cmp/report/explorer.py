@@ -53,7 +53,7 @@ def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS)
         "step_db": STEP_DB,
         "span_db": list(rss_settings.get("span_db", (-50.0, 50.0))),
         "rss": [
-            _rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) | _beside(data, p, start)
+            _rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) | _second_channel(data, p, start)
             for p in data.rss
         ],
         "rank": [_rank(p, start, arrays, share(len(p.time))) for p in data.rank],
@@ -114,7 +114,7 @@ def _rss(
     return channel
 
 
-def _beside(data: ReportData, panel: RssResult, start: np.datetime64) -> dict[str, Any]:
+def _second_channel(data: ReportData, panel: RssResult, start: np.datetime64) -> dict[str, Any]:
     """Return the second channel of a tower and the segments in which the channels differ, as in the paper's Fig. 15."""
     for pair in data.pairs:
         if pair.tower == panel.tower and panel.channel in (pair.first, pair.second):

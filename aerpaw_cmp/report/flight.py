@@ -402,7 +402,7 @@ def serving_card(data: ReportData) -> Card:
         rows=[(name, *row.tolist()) for name, row in zip(names, counts, strict=True)],
     )
     text = paragraph(
-        "The cell that is predicted to be the strongest served in",
+        "The predicted strongest cell was the serving cell in",
         bold(percent(serving.hit_share, 1)),
         f"of {number(serving.n, 0)} samples; always predicting the most frequent serving cell is right in "
         f"{percent(serving.majority_share, 1)}.",

@@ -30,7 +30,7 @@ def filled(texts: Sequence[str], **facts: Any) -> list[str]:
     return [text.format_map(known) for text in texts]
 
 
-def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any) -> str:
+def sentence_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any) -> str:
     """Return sentence and next step from a table by the cause of a verdict. Empty if the table has no such cause."""
     if verdict.cause not in table:
         return ""

@@ -32,7 +32,7 @@ from .canvas import FigureSpec, beyond, colour_bar, draw_areas, draw_tower, mark
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, paragraph, settings_card
 from .charts import Chart, chart_figure
 from .flight_data import RANKS
-from .flight_words import said_of
+from .flight_words import sentence_of
 from .packed import NONE, PackedArrays, ends_of_scale, listed, packed, plan_of, step_for
 from .page import Made, about, json_text, merge, write_figures, write_file
 from .texts import k_key, minute, percent, safe_name
@@ -178,7 +178,7 @@ CAUSES: dict[str, tuple[str, str]] = {
 }
 
 
-def first_words(data: MapsData) -> str:
+def first_sentences(data: MapsData) -> str:
     """Return the summary: coverage at the best and worst height, the cause of gaps, and the next step."""
     heights = coverage(data)
     if not heights:
@@ -187,7 +187,7 @@ def first_words(data: MapsData) -> str:
     thinned = any(item.foliage == "attenuating" for item in data.rss)
     thinner = "compare the rows with attenuating trees" if thinned else "map with `--foliage attenuating`, too"
     shares = {"percent": 100.0 * worst.covered, "outside": 100.0 * worst.outside}
-    sentence = said_of(coverage_verdict(heights), CAUSES, thinner=thinner, **shares)
+    sentence = sentence_of(coverage_verdict(heights), CAUSES, thinner=thinner, **shares)
     best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
     measured = "" if data.corrected else "The map contains no measurement. "
@@ -803,7 +803,7 @@ def maps_page(data: MapsData, files: Sequence[str]) -> str:
     settings = settings_card(data, data.settings)
     remarks = Card(title="Notes", text=[notes(data), beside])
     return Page(
-        kind="maps", title=data.title, verdict=first_words(data), cautions=warnings(data), charts=charts,
+        kind="maps", title=data.title, verdict=first_sentences(data), cautions=warnings(data), charts=charts,
         about=[f"{about} Made {minute(data.generated)}"],
         cards=[Card(title="Map", link="Map", positions=shown), *(card(data) for card in CARDS),
                replace(settings, parts=[*settings.parts, remarks])],

@@ -100,7 +100,7 @@ def write_plan(data: PlanPage, folder: Path) -> list[Path]:
     """Write the page and its files, and return their paths, beginning with the page."""
     shown = payload(
         list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m],
-        note="Solid line: the recommended route. Dashed lines: limits of the area in which it may run.",
+        note="Solid line: the recommended route. Dashed lines: limits of the allowed area.",
     )  # fmt: skip
     written = write_page(folder, "plan", plan_page(data, shown), plan_metrics(data))
     written += [write_file(folder / name, text) for name, text in data.files.items()]

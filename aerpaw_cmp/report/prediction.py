@@ -25,7 +25,7 @@ from ..site.learned import Entry, LearnedSeries
 from ..site.site import Site
 from .cards import HEAD, SHARE, TEXT, Card, Page, Positions, Table, bold, paragraph, write_page
 from .flight_data import RANKS
-from .flight_words import filled, said_of
+from .flight_words import filled, sentence_of
 from .page import Made, about, write_file
 from .places import BAND, LIKELIEST, Places, payload
 from .texts import minute, number
@@ -106,7 +106,7 @@ def heading_words(yaw_deg: FloatArray) -> str:
     return "headings of the route" if np.ptp(yaw_deg) else f"heading {yaw_deg[0]:.0f} degrees"
 
 
-def first_words(
+def first_sentences(
     correction: Correction | None,
     outside: float,
     expected_db: float,
@@ -151,7 +151,7 @@ def first_words(
             verdict = _against_free_space(correction)
             near, far = sorted(map(abs, verdict.interval))
             over = "flights" if len(correction.flights) > 1 else "blocks of the flight"
-            texts.append(said_of(verdict, AGAINST_FREE_SPACE, over=over, near=near, far=far))
+            texts.append(sentence_of(verdict, AGAINST_FREE_SPACE, over=over, near=near, far=far))
         step = _stated(correction)[0].partition("Next: ")[2]
     texts.append(PLAN if outside > MANY else f"Next: {step}" if step else "")
     return " ".join(text for text in texts if text)
@@ -167,11 +167,11 @@ def cautions(correction: Correction, outside: float) -> list[str]:
 def notes(correction: Correction) -> list[str]:
     """Return sentences about the model, about the residual field, and about intervals if held-out data confirm them."""
     stated, holds = _stated(correction)
-    texts = [stated if holds else "", f"Model: {TITLES[correction.base]}.", said_of(field(correction), FIELD)]
+    texts = [stated if holds else "", f"Model: {TITLES[correction.base]}.", sentence_of(field(correction), FIELD)]
     return [text for text in texts if text]
 
 
-def memory_notes(known: Sequence[tuple[Entry, LearnedSeries]]) -> list[str]:
+def stored_model_notes(known: Sequence[tuple[Entry, LearnedSeries]]) -> list[str]:
     """Return sentences about the learned models of the site that a prediction without flights uses."""
     each = lists_by_key((entry.about(), f"{series.tower} {series.channel}") for entry, series in known)
     return [f"{', '.join(names)}: {about}." for about, names in each.items()]
@@ -203,7 +203,7 @@ def _stated(correction: Correction) -> tuple[str, bool]:
     known = np.isfinite(error)
     inside = np.abs(error[known]) <= 1.6449 * sd[known]  # 1.6449 SD is half of a 90 % interval
     share = 100.0 * float(inside.mean()) if known.any() else float("nan")
-    return said_of(verdict, STATED, inside=share), verdict.cause == "none"
+    return sentence_of(verdict, STATED, inside=share), verdict.cause == "none"
 
 
 def _against_free_space(correction: Correction) -> Verdict:

@@ -474,16 +474,16 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
     middle = folded.shape[2] // 2
     near, far = folded[:, :, middle:].copy(), folded[:, :, middle::-1].copy()
     inner = slice(1, -1)
-    if _apart(far[:, 0, inner], near[:, -1, inner]) > _apart(-far[:, 0, inner], near[:, -1, inner]):
+    if _misfit(far[:, 0, inner], near[:, -1, inner]) > _misfit(-far[:, 0, inner], near[:, -1, inner]):
         far = -far
     for pole, next_row in ((0, 1), (-1, -2)):  # the row of a pole may have the sign of either half circle
-        if _apart(near[:, :, pole], near[:, :, next_row]) > _apart(-near[:, :, pole], near[:, :, next_row]):
+        if _misfit(near[:, :, pole], near[:, :, next_row]) > _misfit(-near[:, :, pole], near[:, :, next_row]):
             near[:, :, pole] *= -1
         far[:, :, pole] = -near[:, :, pole]
     return np.concatenate([near, far], axis=1)
 
 
-def _apart(first: ComplexArray, second: ComplexArray) -> float:
+def _misfit(first: ComplexArray, second: ComplexArray) -> float:
     return float((np.abs(first - second) ** 2).sum())
 
 

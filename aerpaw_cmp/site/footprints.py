@@ -313,7 +313,7 @@ def _fill(result: Footprints, shapes: dict[mapfiles.Kind, list[_Shape]], canopy_
     actions = result.actions
     buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
     # where woods overlap, use the first in the file, because woods have no heights to compare
-    woods = _first_keeps(_without_duplicates(shapes["forest"], actions), actions)
+    woods = _forests_without_overlaps(_without_duplicates(shapes["forest"], actions), actions)
     for name, shape, area in _parts(buildings, actions):
         result.buildings.append(
             Building(name, area, round(shape.height_m, 2), material=shape.material, source=shape.source)
@@ -594,7 +594,7 @@ def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
     for shape in sorted(group, key=lambda shape: -shape.height_m):
         over = [higher for higher in disjoint if higher.area.intersects(shape.area)]
         free = _areas_only(shape.area.difference(shapely.union_all([higher.area for higher in over])))
-        same = next((higher for higher in over if _alike(higher, shape)), None)
+        same = next((higher for higher in over if _same_kind(higher, shape)), None)
         if free.is_empty:
             actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
         elif same is not None:
@@ -608,11 +608,11 @@ def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
     return disjoint
 
 
-def _alike(first: _Shape, second: _Shape) -> bool:
+def _same_kind(first: _Shape, second: _Shape) -> bool:
     return abs(first.height_m - second.height_m) <= _SAME_HEIGHT_M and first.material == second.material
 
 
-def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+def _forests_without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
     """Return forests without overlaps, which would double the density of trees."""
     disjoint: list[_Shape] = []
     for group in _groups(shapes):

@@ -371,12 +371,12 @@ def read_learned(site: str | Path) -> Learned:
         If the index names a file outside its folder.
     """
     folder = folder_of(site)
-    memory, lost, damage = mended_index(folder)
+    stored, lost, damage = readable_index(folder)
     if damage is not None:
         again = "; ".join(lost.values()) or "aerpaw-cmp calibrate CALIBRATION.yaml --into-site SITE"
         wanted = f"an index as calibrate writes it; learn it again: {again}"
         raise UsageError(damage.found, expected=wanted, cause="a damaged file", path=damage.path, line=damage.line)
-    for name, entry in memory.entries.items():
+    for name, entry in stored.entries.items():
         if entry.sha256 != entry.digest:
             raise UsageError(
                 f"the values of {name!r} are not those that were written (SHA-256)",
@@ -384,10 +384,10 @@ def read_learned(site: str | Path) -> Learned:
                 cause="an edited value",
                 path=folder / _INDEX,
             )
-    return memory
+    return stored
 
 
-def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | None]:
+def readable_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | None]:
     """Read the index in a folder of learned models, even if it is damaged or values of an entry were edited.
 
     Returns
@@ -408,13 +408,13 @@ def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | No
     """
     index, lost, damage = inside(folder, _INDEX, folder / _INDEX), dict[str, str](), None
     try:
-        memory = load_yaml(index, Learned) if index.is_file() else Learned()
-        if memory.names != [*memory.entries]:
-            raise UsageError(f"names {', '.join(memory.names)}, but entries {', '.join(memory.entries)}", path=index)
+        stored = load_yaml(index, Learned) if index.is_file() else Learned()
+        if stored.names != [*stored.entries]:
+            raise UsageError(f"names {', '.join(stored.names)}, but entries {', '.join(stored.entries)}", path=index)
     except UsageError as error:
-        damage, memory = error, Learned()
+        damage, stored = error, Learned()
         text = read_bounded(index, LARGEST_TABLE, "an index").decode("utf-8", "replace")
-        if re.search(rf"^format: (?!{memory.format}\s*$)", text, re.M):
+        if re.search(rf"^format: (?!{stored.format}\s*$)", text, re.M):
             raise
         for block in re.split(r"^(?=  [A-Za-z0-9][\w.-]*:\s*$)", text, flags=re.M)[1:]:
             name = block.split(":")[0].strip()
@@ -422,18 +422,18 @@ def mended_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | No
             if isinstance(entry, str):
                 lost[name] = entry
             else:
-                memory.entries[name] = entry
+                stored.entries[name] = entry
         names = {*re.findall(r"[\w.-]+", "".join(re.findall(r"^names: \[([^]]*)", text, re.M)))}
-        lost |= {name: f"the calibration of {name}" for name in sorted(names - {*memory.entries, *lost})}
-    for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
+        lost |= {name: f"the calibration of {name}" for name in sorted(names - {*stored.entries, *lost})}
+    for name in {name for entry in stored.entries.values() for name in (*files_of(entry), *entry.tables)}:
         # check before a file is opened, because an index may be untrusted
         inside(folder, name, index, plain=True)
-    return memory, lost, damage
+    return stored, lost, damage
 
 
-def mend_remark(folder: Path, learning: Container[str]) -> list[str]:
+def damage_remark(folder: Path, learning: Container[str]) -> list[str]:
     """Return a sentence about a damaged index that is rewritten when the entries ``learning`` are learned."""
-    _, lost, damage = mended_index(folder)
+    _, lost, damage = readable_index(folder)
     if damage is None:
         return []
     again = [f"{name} ({command})" for name, command in lost.items() if name not in learning]
@@ -474,7 +474,7 @@ def _digest(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
-def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, bytes]) -> list[Path]:
+def store_entry(site: str | Path, name: str, entry: Entry, files: Mapping[str, bytes]) -> list[Path]:
     """Write an entry and its tables into the learned models of a site, with the index last.
 
     Parameters
@@ -505,12 +505,12 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         folder.mkdir(exist_ok=True)
         # if two calibrations of one site run at once, neither may overwrite the entry of the other
         with locked(folder):
-            memory, _, damage = mended_index(folder)
+            stored, _, damage = readable_index(folder)
             if damage is not None:
                 write_whole(damaged_copy(folder), (folder / _INDEX).read_bytes())
             # replace only files of calibrations: files with a digest in an entry, edited tables, and tables of a killed
             # run
-            written = {item for known in memory.entries.values() for item in known.tables.items()}
+            written = {item for known in stored.entries.values() for item in known.tables.items()}
             for file in packed:
                 place = inside(folder, file, folder / _INDEX, plain=True)
                 known = {*written, *tables.items()}
@@ -524,10 +524,10 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
                 write_whole(folder / file, content)
             made = entry.model_copy(update={"tables": tables})
             made = made.model_copy(update={"sha256": made.digest})
-            entries = dict(sorted({**memory.entries, name: made}.items()))
-            memory = Learned(names=list(entries), entries=entries)
+            entries = dict(sorted({**stored.entries, name: made}.items()))
+            stored = Learned(names=list(entries), entries=entries)
             # write the index after the tables, so that every entry has its files
-            write_whole(folder / _INDEX, dump_yaml(memory.model_dump(mode="json", exclude_none=True)))
+            write_whole(folder / _INDEX, dump_yaml(stored.model_dump(mode="json", exclude_none=True)))
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):
                 # do not remove a table that a user has changed
@@ -536,7 +536,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     return [folder / _INDEX, *(folder / file for file in files)]
 
 
-def carry_memory(base: str | Path, site: Path) -> list[str]:
+def copy_learned(base: str | Path, site: Path) -> list[str]:
     """Copy the learned models of a base site next to a new site, and return a line that says so."""
     origin, folder = folder_of(base), folder_of(site)
     if not origin.is_dir() or (folder / _INDEX).exists():
@@ -552,7 +552,7 @@ def carry_memory(base: str | Path, site: Path) -> list[str]:
     return [f"learned antennas and receivers of the base were copied to {folder.name}: {', '.join(entries)}"]
 
 
-def memory_lines(site: str | Path) -> list[str]:
+def learned_lines(site: str | Path) -> list[str]:
     """Return lines about the learned models of a site."""
     lines = []
     for name, entry in read_learned(site).entries.items():

@@ -224,12 +224,12 @@ def main_tag(tags: Mapping[str, str]) -> str:
     >>> main_tag({"natural": "scrub"}), main_tag({"demolished:building": "yes"}), main_tag({"name": "A"})
     ('natural=scrub', 'demolished:building=yes', 'untagged')
     """
-    said = [key for key in _TELLING if key in tags] + [key for key in tags if key.endswith(":building")]
-    said += ["building"] if tags.get("building", "").lower() == "no" else []
-    return f"{said[0]}={tags[said[0]]}" if said else "untagged"
+    described = [key for key in _MAIN_KEYS if key in tags] + [key for key in tags if key.endswith(":building")]
+    described += ["building"] if tags.get("building", "").lower() == "no" else []
+    return f"{described[0]}={tags[described[0]]}" if described else "untagged"
 
 
-_TELLING = ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "barrier", "boundary", "man_made",
+_MAIN_KEYS = ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "barrier", "boundary", "man_made",
             "power", "aeroway")  # fmt: skip
 
 

@@ -221,7 +221,7 @@ def ground_share(scene: TriangleScene) -> float:
 _MAST_M, _TOUCHES_M = 4.0, 0.5
 
 
-def without_traps(
+def usable_scene(
     scene: TriangleScene, antennas_m: Mapping[str, FloatArray]
 ) -> tuple[TriangleScene, tuple[Forest, ...], list[str]]:
     """Remove meshes of vegetation, and meshes that would enclose an antenna.

@@ -36,7 +36,7 @@ from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines
 from .materials import material
 from .mitsuba import TriangleScene
 from .relief import Dem, Surface, read_dem, surface_through
-from .scenes import placed_scene, without_traps
+from .scenes import placed_scene, usable_scene
 from .site import NEAREST, Building, Forest, Geofence, Site, Tower, Trees
 
 # Packaged sites by name.
@@ -430,7 +430,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         area = _checked_area(model.area_m, [t.east_m for t in places], [t.north_m for t in places])
     woods: tuple[Forest, ...] = ()
     if scene is not None:
-        scene, woods, scene_notes = without_traps(scene, {name: tower.position_m for name, tower in towers.items()})
+        scene, woods, scene_notes = usable_scene(scene, {name: tower.position_m for name, tower in towers.items()})
         notes += scene_notes
     buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
     notes += _overlaps(buildings)

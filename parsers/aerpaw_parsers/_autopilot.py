@@ -175,7 +175,7 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     rows.mark(lost, "no_fix")
     for name in _pose.PLACE:
         values[name] = np.where(lost, np.nan, values[name])
-    rows.warnings += _apart(flight, time_s, values)
+    rows.warnings += _position_warning(flight, time_s, values)
     if logged is not None:
         height = np.where(lost, np.nan, logged)
         above = _pose.from_logged_heights(rows, time_s, values["altitude_m"], height, home_m, one_estimate=True)
@@ -196,7 +196,7 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
 _APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
 
 
-def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> list[str]:
+def _position_warning(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> list[str]:
     """Return a warning if the positions of the autopilot are far from the positions of its receiver."""
     fixed = flight.fix.near("fix", time_s) >= _FIX_3D
     there_n, there_e = (np.where(fixed, flight.fix.near(name, time_s), np.nan) for name in _pose.PLACE[:2])

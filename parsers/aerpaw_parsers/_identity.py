@@ -255,7 +255,7 @@ def few(texts: Iterable[str]) -> bool:
 # of the median step between values. The share is _SMALLER, or _SELDOM if the value changes less than _FEWEST times.
 # They alternate in a fixed order if at least _IN_TURN of the rows repeat the order of the rows before. _FEWEST is also
 # the smallest number of rows.
-_SMALLER, _SELDOM, _IN_TURN, _FEWEST = 0.5, 0.2, 0.8, 8
+_SMALLER, _SMALLER_IF_RARE, _IN_TURN, _FEWEST = 0.5, 0.2, 0.8, 8
 
 
 def _alternates(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) -> tuple[bool, bool]:
@@ -269,7 +269,7 @@ def _alternates(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) ->
     if not changed.any() or len(texts) < 2 * count:
         return False, False
     within = np.concatenate([np.abs(np.diff(values[texts == text])) for text in {*texts.tolist()}])
-    smaller = _SMALLER if changed.sum() >= _FEWEST else _SELDOM
+    smaller = _SMALLER if changed.sum() >= _FEWEST else _SMALLER_IF_RARE
     alternates = _typical(within) < smaller * _typical(np.abs(np.diff(values))[changed])
     in_turns = min(changed.mean(), (texts[count:] == texts[:-count]).mean()) >= _IN_TURN
     return alternates, alternates and bool(in_turns)

@@ -43,7 +43,7 @@ def from_sheet(rows: Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> St
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
     # 'rx lat' belongs to 'rx long', in any order of the columns
-    latitudes, longitudes = ({_PLACE.sub("", sheet.plain[i]): i for i in _alike(sheet, name)} for name in PLACE[:2])
+    latitudes, longitudes = ({_PLACE.sub("", sheet.plain[i]): i for i in _fitting(sheet, name)} for name in PLACE[:2])
     pairs = [(i, longitudes[rest]) for rest, i in latitudes.items() if rest in longitudes]
     if len(pairs) > 1:
         spans_deg = [max(np.nanmax(angle) - np.nanmin(angle) for angle in map(sheet.numbers, pair)) for pair in pairs]
@@ -85,7 +85,7 @@ _PLACE = re.compile(r"\b(lat|latitude|lon|lng|long|longitude)\b")
 _AT_REST_DEG = 2e-4
 
 
-def _alike(sheet: _sheet.Sheet, name: str) -> list[int]:
+def _fitting(sheet: _sheet.Sheet, name: str) -> list[int]:
     """Return the columns with values whose names fit a quantity equally well."""
     ranks = {
         i: dictionary.rank_of(what.quantity, sheet.plain[i])

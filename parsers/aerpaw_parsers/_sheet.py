@@ -188,7 +188,7 @@ class Sheet:
         sentence about the table.
     closed : bool
         True if rows have their own end mark, so that a missing line end does not matter.
-    said : dict
+    mapped : dict
         Quantities that the user maps to columns with other names, by column.
     used : set of int
         Columns that are used in a stream; all parts of the table share this set.
@@ -202,7 +202,7 @@ class Sheet:
     rejected: list[RejectedLine] = field(default_factory=list)
     notes: dict[int, str] = field(default_factory=dict)
     closed: bool = False
-    said: dict[int, dictionary.Quantity] = field(default_factory=dict)
+    mapped: dict[int, dictionary.Quantity] = field(default_factory=dict)
     used: set[int] = field(default_factory=set)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
     _cell_units: dict[int, str] = field(default_factory=dict)
@@ -232,8 +232,8 @@ class Sheet:
     @cached_property
     def meanings(self) -> list[dictionary.Meaning | None]:
         """The meaning of each column."""
-        said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
-        known = [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
+        mine = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.mapped.items()}
+        known = [what or mine.get(i) for i, (what, *_) in enumerate(self._described[1])]
         rats = {i for i, what in enumerate(known) if what and what.quantity.name == "technology"}
         # a column such as 'radio' may contain names of receivers
         unlike = {i for i in rats if not any(dictionary.has("any_rat", row[i]) for row in self.cells[:200])}
@@ -440,27 +440,27 @@ class Sheet:
         more = f" and {len(left) - _MOST_NAMED} more" if left[_MOST_NAMED:] else ""
         # omit remarks about the conversion of a column that is not read
         idle = {i for i, _ in enumerate(self.names) if i not in self.used and self.unit(i) in dictionary.ACROSS_50_OHM}
-        said = [text for i, text in sorted(self.notes.items()) if i not in idle]
+        out = [text for i, text in sorted(self.notes.items()) if i not in idle]
         if left:
-            said.append(f"not read, though they look like levels, identities, positions, times or flags: {shown}{more}")
+            out.append(f"not read, though they look like levels, identities, positions, times or flags: {shown}{more}")
         words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
         shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
         text = "If one names the cell or device of a row, call it 'cell' or 'device' (or --map NAME=cell)"
-        said += [f"not read: {shown}. {text}"] * bool(words)
+        out += [f"not read: {shown}. {text}"] * bool(words)
         gains = [i for i in left if dictionary.has("gain", self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         text = "changes, and levels are not corrected for it: do they already include it?"
-        said += [f"column {self.names[i]!r} {text}" for i in gains[:1]]
+        out += [f"column {self.names[i]!r} {text}" for i in gains[:1]]
         # use only comments near the table, because a long log may have many comments between its rows
         near = (i for i in self.blank_rows.tolist() if len(self) and (i < TITLES or 0 < i - self.row[-1] <= TITLES))
         beside = {i + 1: self.lines.text(i).strip('#%;" ') for i in near}
-        said += [
+        out += [
             f"line {number} is not read: {text[:80]!r}"
             for number, text in beside.items()
             if dictionary.has("of_values", text) and not text.startswith(self.names[0] or "?")
         ]
         equal = len(self) - len({*map(tuple, self.cells)})
         text = f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?"
-        return said + [text] * (equal > _MOST_EQUAL * len(self))
+        return out + [text] * (equal > _MOST_EQUAL * len(self))
 
     def _is_of_interest(self, column: int) -> bool:
         """Check whether a column has values and looks like a level, an identity, a position or a time."""
@@ -784,10 +784,10 @@ def _whole_rows(rows: list[_Row], names: list[str], last_line: int) -> list[_Row
     if sum(row.line != last_line for row in short) < max(2, len(full) // 20):
         return full
     meanings = [dictionary.meaning(name) for name in names]
-    return sorted([*full, *(row for row in short if not _torn(row.cells, meanings))])
+    return sorted([*full, *(row for row in short if not _is_truncated(row.cells, meanings))])
 
 
-def _torn(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
+def _is_truncated(cells: list[str], meanings: list[dictionary.Meaning | None]) -> bool:
     """Check whether a short row is truncated: it has half a position, or a value that is impossible in its column."""
     place = {"latitude_deg": False, "longitude_deg": False}
     for text, meaning in zip(cells, meanings, strict=False):
@@ -994,11 +994,11 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         sheet.used.add(half[0])
         texts = [" ".join(pair) for pair in zip(texts, sheet.texts(half[0]), strict=True)]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
-    count = next((short for short, c in _text.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
+    count = next((short for short, c in _text.COUNTS.items() if c.word.search(unit) or c.word.search(name)), None)
     if dictionary.has("elapsed", name):
         texts, count = [_stamps.in_seconds(text) for text in texts], count or "s"
     count = count or ("s" if unit else None)
-    written = dictionary.without_unit(sheet.names[column])[1] or any(c.said.search(name) for c in _text.COUNTS.values())
+    written = dictionary.without_unit(sheet.names[column])[1] or any(c.word.search(name) for c in _text.COUNTS.values())
     are_seconds = count is not None and _stamps.are_seconds(sheet.numbers(column), count)
     if are_seconds and (not written or _EPOCH_S[0] < np.nanmedian(sheet.numbers(column)) < _EPOCH_S[1]):
         who = (

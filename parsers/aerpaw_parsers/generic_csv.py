@@ -136,7 +136,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     sheet.used |= {*where.values()}
     for name in {*_NAMED} & {*where}:
         sheet.names[where.pop(name)] = name
-    sheet.said = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
+    sheet.mapped = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
     rows = _sheet.rows(sheet, options, reader="generic_csv", column=where.pop("time"))
     for column in (where[name] for name in _VALUE[kind]):
         if len(sheet) and not any(sheet.texts(column)):

@@ -67,7 +67,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         raise InputError("a GPX track without times", expected="<time> in its points", cause="a route: save it as KML")
     row = lines.number_at(at for at, _ in points)
     readings = [(int(i), cells) for i, (_, cells) in zip(row, points, strict=True)]
-    sheet = _sheet.of_readings(lines, readings, _torn(lines, data, row))
+    sheet = _sheet.of_readings(lines, readings, _truncated(lines, data, row))
     rows = _sheet.rows(sheet, options, reader="gpx")
     begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
@@ -86,7 +86,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result(streams)
 
 
-def _torn(lines: Lines, data: bytes, row: IntArray) -> list[RejectedLine]:
+def _truncated(lines: Lines, data: bytes, row: IntArray) -> list[RejectedLine]:
     """Return the lines on which an incomplete point begins."""
     tracked = b"<trkpt" in data
     starts = (start.start() for start in _START.finditer(data) if b"trkpt" in start[0] or not tracked)

@@ -142,7 +142,7 @@ def drawn(generator, model, rows):
 def test_slope_of_the_likelihood_by_differences():
     generator = np.random.default_rng(7)
     rows = flights(generator, each=40)
-    value, apart = drawn(generator, MOVING, rows), field_gp._Apart.of(rows, rows)
+    value, apart = drawn(generator, MOVING, rows), field_gp._Pairs.of(rows, rows)
     names = tuple(field_gp.BOUNDS)
     _, slope = field_gp._likelihood(MOVING, apart, value, names)
     for name, partial in zip(names, slope, strict=True):

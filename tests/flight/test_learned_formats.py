@@ -30,9 +30,9 @@ from aerpaw_cmp.site.learned import (
     SpherePattern,
     folder_of,
     read_table,
-    remember,
     sphere_csv,
     sphere_grid,
+    store_entry,
     unit_mean_gain,
 )
 from aerpaw_cmp.site.siteyaml import load_site
@@ -82,7 +82,7 @@ def known_site(folder: Path, turn_deg: int = 0, *, general: bool = True) -> Path
         level = LearnedLevel(offset_db=offset_db, sd_db=1.7, transmit_power_dbm=40.0, unit="dB re full scale")
         names = {"uav_file": "u.csv.gz", "known_file": "k.csv.gz", "tower_known_file": "m.csv.gz"}
         series.append(learned_series(channel, **names, level=level, shares_airframe=general))
-    remember(place, "past", learned_entry(*series), files)
+    store_entry(place, "past", learned_entry(*series), files)
     return place
 
 
@@ -230,7 +230,7 @@ def test_antennas_of_two_campaigns_are_compared_with_the_same_alternatives(tmp_p
     tables = {copy: read_table(past / name, "") for copy, name in (("v.csv.gz", "u.csv.gz"), ("l.csv.gz", "k.csv.gz"),
                                                                   ("n.csv.gz", "m.csv.gz"))}  # fmt: skip
     series = learned_series("third", **names, shares_airframe=False)
-    remember(site, "other", learned_entry(series), {**tables, "c.csv.gz": table(0.8 * TOWERS["USRP2"])})
+    store_entry(site, "other", learned_entry(series), {**tables, "c.csv.gz": table(0.8 * TOWERS["USRP2"])})
     _, content = drafted(renamed_log, tmp_path, site)
     assert sorted(content["antennas"].values()) == ["mine/past_LW1.USRP2", "mine/past_uav"]
     capsys.readouterr()

@@ -38,9 +38,9 @@ def flight(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(audit_flight, "_audit", lambda *_: calls.append(1) or MADE)
 
-    def made(data, replays=None, anew=False):
+    def made(data, replays=None, fresh=False):
         calls.clear()
-        audit_flight.audit_replays(data, replays or replay_flight(data).all, anew=anew)
+        audit_flight.audit_replays(data, replays or replay_flight(data).all, fresh=fresh)
         return bool(calls)
 
     return load_data(load_flight(path), tmp_path), made
@@ -50,8 +50,8 @@ def test_the_second_audit_of_the_same_is_read_and_says_its_day(flight):
     data, made = flight
     assert made(data)
     assert not made(data)
-    assert made(data, anew=True)
-    again = audit_flight.audit_replays(data, replay_flight(data).all, anew=False).audit
+    assert made(data, fresh=True)
+    again = audit_flight.audit_replays(data, replay_flight(data).all, fresh=False).audit
     assert dataclasses.replace(again, read_from_cache_of="") == MADE
     assert f"Read from the cache of {again.read_from_cache_of}" in audit_summary(again)
     assert "cache" not in audit_summary(MADE)

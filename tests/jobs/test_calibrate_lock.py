@@ -20,7 +20,7 @@ from aerpaw_cmp.flight.rows import LOCK_FLOOR_DB
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.jobs import calibrate
 from aerpaw_cmp.jobs.calibrate import learned_locks, lock_words
-from aerpaw_cmp.site.learned import LearnedLock, read_learned, remember
+from aerpaw_cmp.site.learned import LearnedLock, read_learned, store_entry
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
@@ -108,7 +108,7 @@ def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_p
         constant_log_score=0.6, floor_db=-15.0, floor_rmse_db=8.2, free_space_floor_rmse_db=10.3,
     )  # fmt: skip
     entry = learned_entry(learned_series("power", tower="ROVER", carrier_hz=3.32e9, lock=lock))
-    remember(tmp_path / "mine.yaml", "afar", entry, learned_tables("power"))
+    store_entry(tmp_path / "mine.yaml", "afar", entry, learned_tables("power"))
     assert read_learned(tmp_path / "mine.yaml").entries["afar"].series[0].lock == lock
 
     def known(antennas: dict[str, str], receiver: str = "", log: str = "b" * 64) -> LearnedLock | None:

@@ -25,7 +25,7 @@ from aerpaw_cmp.jobs.flight_run import (
     recommended_changes,
     run_flight,
 )
-from aerpaw_cmp.site.learned import Errors, folder_of, remember, sphere_csv, unit_mean_gain
+from aerpaw_cmp.site.learned import Errors, folder_of, sphere_csv, store_entry, unit_mean_gain
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 from tests.simulated import planned, simulate, write_yaml
 from tests.tables import eastwards, rss_log
@@ -173,7 +173,7 @@ def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64, tow
     sphere = sphere_csv(table, np.ones(table.shape), (f"aerpaw-cmp calibrate: some, trained_on: {trained_on}",))
     errors = Errors(series=2, rmse_db=learned_db, rmse_4s_db=2.0, free_space_rmse_db=5.0, inside_90=0.9)
     entry = learned_entry(learned_series("A", tower=tower), errors=errors, trained_on=[trained_on])
-    remember(site, "some", entry, learned_tables("A", t=sphere.encode(), u=sphere.encode()))
+    store_entry(site, "some", entry, learned_tables("A", t=sphere.encode(), u=sphere.encode()))
     path = flight(folder)
     path.write_text(path.read_text().replace("file: lake_wheeler", "file: mine.yaml"), encoding="utf-8")
     return path

@@ -11,7 +11,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.gains import Spread, offset_sd_db
 from aerpaw_cmp.jobs import predict
-from aerpaw_cmp.jobs.sources import Memory, TargetOptions, named_flights
+from aerpaw_cmp.jobs.sources import Stored, TargetOptions, named_flights
 from aerpaw_cmp.site.learned import (
     Entry,
     Errors,
@@ -20,8 +20,8 @@ from aerpaw_cmp.site.learned import (
     LearnedSpread,
     folder_of,
     read_learned,
-    remember,
     sphere_csv,
+    store_entry,
 )
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.jobs.calibrated import OFFSET_DB, past_sector_antenna
@@ -64,7 +64,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a site with one learned channel at LW1: cosines of 4 dB and 2 dB at its ends."""
     place = copied(tmp_path_factory.mktemp("memory"))
     files = learned_tables("A", t=table(4.0, (1.0, 5.0)), u=table(2.0, (0.5, 0.5), f"marks: {MARK}"))
-    remember(place, "planted", entry(LEVEL), files)
+    store_entry(place, "planted", entry(LEVEL), files)
     tower = load_site("lake_wheeler").towers["LW1"].position_m
     ends = (300.0, 90.0), (300.0, 270.0), (-300.0, 90.0), (9000.0, 90.0)
     rows = [(tower[0] + away, tower[1], tower[2], yaw) for away, yaw in ends]
@@ -102,7 +102,7 @@ def test_a_receiver_that_loses_its_lock_is_forecast_in_two_parts(site: Path, tmp
         constant_log_score=0.6, floor_db=-80.0, floor_rmse_db=3.0, free_space_floor_rmse_db=5.0,
     )  # fmt: skip
     place = copied(tmp_path)
-    remember(place, "planted", entry(LEVEL, lock), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
+    store_entry(place, "planted", entry(LEVEL, lock), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
     points = site.parent / "p.csv"
     plain, said = (predict.predict(points, [], TargetOptions(site=str(at))) for at in (site, place))
     levels, before = (x.table[x.table["channel"] == "A"] for x in (said, plain))
@@ -148,7 +148,7 @@ def test_an_unknown_heading_adds_the_spread_of_the_gain_over_headings(site: Path
 def test_a_site_without_learned_levels_is_predicted_by_the_prior_and_says_so(tmp_path: Path) -> None:
     place = copied(tmp_path)
     assert predict.predict(place, []).page.chosen["base"] == "prior"
-    remember(place, "old", entry(None), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
+    store_entry(place, "old", entry(None), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
     page = predict.predict(place, []).page
     assert page.chosen["base"] == "prior"
     assert any("have no level" in text for text in page.warnings)
@@ -190,7 +190,7 @@ def test_remembered_antennas_stand_beside_other_bases_but_not_on_their_own_fligh
     bases = {name: {row["base"] for row in said.page.candidates} for name, said in known.items()}
     assert "learned antennas of the site" in bases["aside"]
     assert "learned antennas of the site" not in bases["first"]
-    assert not isinstance(known["first"].model, Memory)
+    assert not isinstance(known["first"].model, Stored)
 
 
 def test_a_calibration_file_names_its_flights(flown: Path) -> None:

@@ -15,7 +15,7 @@ from aerpaw_cmp.propagation.field.foliage import stand_depth_m
 from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.mitsuba import TriangleScene
-from aerpaw_cmp.site.scenes import without_traps
+from aerpaw_cmp.site.scenes import usable_scene
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.scene_files import box
 from tests.simulated import planned, simulate, write_yaml
@@ -214,7 +214,7 @@ def test_a_mesh_is_as_full_as_its_volume_and_its_parts_stand_apart() -> None:
         shapes=("crowns", "hill"),
         materials=("vegetation", "concrete"),
     )
-    without, woods, notes = without_traps(scene, {"T": np.array([0.0, 0.0, 5.0])})
+    without, woods, notes = usable_scene(scene, {"T": np.array([0.0, 0.0, 5.0])})
     assert [wood.filled for wood in woods] == pytest.approx([1 / 3, 1 / 3])
     assert [wood.base_m for wood in woods] == pytest.approx([0.0, -2.0])
     assert set(without.shape.tolist()) == {1}

@@ -17,7 +17,7 @@ from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report import maps as maps_html
 from aerpaw_cmp.report import prediction as prediction_html
 from aerpaw_cmp.report.calibration import CalibrationData, sentences
-from aerpaw_cmp.report.prediction import cautions, first_words
+from aerpaw_cmp.report.prediction import cautions, first_sentences
 from benchmarks import fabricated
 
 Fixture = Callable[[str], Any]
@@ -101,7 +101,7 @@ def prediction(fixture: Fixture) -> str:
     )  # fmt: skip
     data = prediction_html.PredictionPage(
         name="route", kind="route", site=fixture("maps_data").site, table=table, units={"LW1 USRP1": "dBm"}, shape=None,
-        heights_m=(40.0,), verdict=first_words(chosen, 0.34, 2.0, 5.0), candidates=[], model={"noise_sd_db": 1.0},
+        heights_m=(40.0,), verdict=first_sentences(chosen, 0.34, 2.0, 5.0), candidates=[], model={"noise_sd_db": 1.0},
         chosen={"title": "antennas learned from the named flights, no correction", "sd_factor": 1.0, "left_out": "flights"},
         flown={}, flights=("F0", "F1"), trained_on=(), marks=(), warnings=cautions(chosen, 0.34),
         generated="2026-11-21T00:00:00+00:00", versions={}, stages_s={},

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.maps import MapsData, RssMap, first_words, warnings
+from aerpaw_cmp.report.maps import MapsData, RssMap, first_sentences, warnings
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_the_cause_that_was_put_in_is_said(
         RssMap(**joint, coverage=share, foliage=mode, values=np.where(count < share * level.size, level, np.nan))
         for mode, share in covered.items()
     )
-    text = first_words(dataclasses.replace(maps_data, rss=rss, **change)).replace("\N{MINUS SIGN}", "-")
+    text = first_sentences(dataclasses.replace(maps_data, rss=rss, **change)).replace("\N{MINUS SIGN}", "-")
     assert said in text
     assert "Best height" not in text  # one height has no best
 
@@ -50,18 +50,18 @@ def test_the_cause_that_was_put_in_is_said(
 def test_gaps_with_a_path_below_the_threshold_are_not_blamed_on_buildings(maps_data: MapsData) -> None:
     level = np.zeros((len(maps_data.north_m), len(maps_data.east_m)))
     weak = RssMap(tower="joint", antennas="MIMO", height_m=30.0, coverage=0.6, foliage="none", values=level)
-    text = first_words(dataclasses.replace(maps_data, rss=(weak,)))
+    text = first_sentences(dataclasses.replace(maps_data, rss=(weak,)))
     assert "there is a path, but its level is below the threshold" in text
     assert text.endswith("Next: compare with one element (Antennas: SISO), because the beam of the array has nulls.")
 
 
 def test_several_heights_name_the_best_and_the_worst(maps_data: MapsData) -> None:
     joint = {m.height_m: m.coverage for m in maps_data.rss if m.tower == "joint" and m.antennas == "SISO"}
-    text = first_words(maps_data)
+    text = first_sentences(maps_data)
     assert f"Best height: {max(joint, key=lambda h: joint[h]):g} m, {100 * max(joint.values()):.1f} %." in text
     assert f"Lowest coverage: {100 * min(joint.values()):.1f} % of the positions at 30 m" in text
     alike = tuple(dataclasses.replace(item, coverage=1.0) for item in maps_data.rss)
-    assert "Best height" not in first_words(dataclasses.replace(maps_data, rss=alike))
+    assert "Best height" not in first_sentences(dataclasses.replace(maps_data, rss=alike))
 
 
 def test_warnings_stand_only_under_their_condition(maps_data: MapsData) -> None:

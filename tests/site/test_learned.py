@@ -30,14 +30,14 @@ from aerpaw_cmp.site.learned import (
     LearnedReceiver,
     LearnedSpread,
     SpherePattern,
-    carry_memory,
+    copy_learned,
     files_of,
     find_named,
     folder_of,
     learned_antenna,
     read_learned,
-    remember,
     sphere_csv,
+    store_entry,
 )
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 
@@ -63,7 +63,7 @@ LOCK = LearnedLock(
 def folder(tmp_path: Path) -> Path:
     """Return a site with one learned channel, whose tower antenna is 3 dB below its UAV antenna."""
     low = sphere_csv(np.full((7, 8), -3.0), np.ones((7, 8)), ("aerpaw-cmp calibrate: c", f"marks: {MARK}")).encode()
-    remember(tmp_path / "mine.yaml", "d12", entry("A"), learned_tables("A", (f"marks: {MARK}",), t=low))
+    store_entry(tmp_path / "mine.yaml", "d12", entry("A"), learned_tables("A", (f"marks: {MARK}",), t=low))
     return tmp_path
 
 
@@ -88,7 +88,7 @@ def flight(folder: Path, antennas: dict[str, str], carrier_hz: float = CARRIER_H
 )
 def test_levels_are_compared_with_antennas_of_other_flights_alone(folder, site, loses_lock, log, towers) -> None:
     if loses_lock:
-        remember(folder / "mine.yaml", "d12", entry("A", lock=LOCK), learned_tables("A", (f"marks: {MARK}",)))
+        store_entry(folder / "mine.yaml", "d12", entry("A", lock=LOCK), learned_tables("A", (f"marks: {MARK}",)))
     log = log, MARK if log == "copy" else ""
     assert {tower for tower, gains in learned_towers(folder / site, log, loses_lock=True).items() if gains} == towers
 
@@ -217,7 +217,7 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
 )
 def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | None, said: str) -> None:
     receiver = LearnedReceiver(tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=CARRIER_HZ, file="r.json.gz")
-    remember(
+    store_entry(
         folder / "mine.yaml",
         "nr",
         entry("A").model_copy(update={"series": [], "receivers": [receiver]}),
@@ -250,8 +250,8 @@ def test_a_damaged_memory_is_one_message(folder: Path, text: str) -> None:
 
 def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(folder: Path) -> None:
     site = folder / "mine.yaml"
-    remember(site, "other", entry("B"), learned_tables("B"))
-    remember(site, "d12", entry("C"), learned_tables("C"))
+    store_entry(site, "other", entry("B"), learned_tables("B"))
+    store_entry(site, "d12", entry("C"), learned_tables("C"))
     assert set(read_learned(site).entries) == {"d12", "other"}
     assert {p.name for p in folder_of(site).iterdir()} == {
         "learned.yaml", *learned_tables("B"), *learned_tables("C")
@@ -265,7 +265,7 @@ def test_an_index_of_another_version_stays_as_it_was(folder: Path) -> None:
     values = yaml.safe_load(index.read_text())["entries"]["d12"] | {"spread_db": 1.5}
     values["sha256"] = memory._digest(values)
     index.write_text(before := dump_yaml({"format": memory.Learned().format, "entries": {"d12": values}}))
-    for attempt in (lambda: read_learned(site), lambda: remember(site, "other", entry("B"), learned_tables("B"))):
+    for attempt in (lambda: read_learned(site), lambda: store_entry(site, "other", entry("B"), learned_tables("B"))):
         with pytest.raises(UsageError, match="spread_db"):
             attempt()
     assert index.read_text() == before
@@ -284,7 +284,7 @@ def test_a_memory_that_names_a_file_of_others_touches_and_shows_none(
     index = folder_of(site) / "learned.yaml"
     index.write_text(index.read_text().replace(key, key.replace("A.t.csv.gz", name.format(folder=folder))))
     with pytest.raises(InputError, match=r"leaves its folder|no file of its folder"):
-        remember(site, "d12", entry("A"), learned_tables("A"))
+        store_entry(site, "d12", entry("A"), learned_tables("A"))
     assert main(["predict", str(site), "-o", str(folder / "out")]) == 3
     said = capsys.readouterr()
     assert "years of work" not in said.out + said.err
@@ -317,21 +317,21 @@ def test_a_copied_memory_is_whole_or_not_there_and_holds_its_own_files_alone(
     with monkeypatch.context() as patch:
         patch.setattr(memory, "write_whole", full)
         with pytest.raises(OutputError, match="the disk is full"):
-            carry_memory(folder / "mine.yaml", copy)
+            copy_learned(folder / "mine.yaml", copy)
     assert read_learned(copy).entries == {}
-    assert carry_memory(folder / "mine.yaml", copy)
+    assert copy_learned(folder / "mine.yaml", copy)
     names = {"learned.yaml", *learned_tables("A")}
     assert {place.name: place.read_bytes() for place in folder_of(copy).iterdir()} == {
         name: (own / name).read_bytes() for name in names
     }
-    assert carry_memory(folder / "mine.yaml", copy) == []
+    assert copy_learned(folder / "mine.yaml", copy) == []
 
 
 @pytest.mark.parametrize("end", [0, 80, -1])
 def test_a_truncated_table_is_replaced_by_learning_again(folder: Path, end: int) -> None:
     table = folder_of(folder / "mine.yaml") / "A.t.csv.gz"
     table.write_bytes(table.read_bytes()[:end])
-    remember(folder / "mine.yaml", "d12", entry("A"), learned_tables())
+    store_entry(folder / "mine.yaml", "d12", entry("A"), learned_tables())
     assert gzip.decompress(table.read_bytes()) == learned_tables()["A.t.csv.gz"]
 
 
@@ -342,18 +342,18 @@ def test_a_table_that_no_calibration_wrote_is_neither_replaced_nor_removed(folde
     (folder_of(site) / name).write_bytes(b"mine")
     before = (folder_of(site) / "learned.yaml").read_text()
     with pytest.raises(UsageError, match="no calibration wrote this file"):
-        remember(site, "d12", entry(name[0]), learned_tables(name[0]))
+        store_entry(site, "d12", entry(name[0]), learned_tables(name[0]))
     assert (folder_of(site) / "learned.yaml").read_text() == before
-    remember(site, "d12", entry("C"), learned_tables("C"))
+    store_entry(site, "d12", entry("C"), learned_tables("C"))
     assert (folder_of(site) / name).read_bytes() == b"mine"
     assert not (folder_of(site) / "A.u.csv.gz").exists()
 
 
 def test_two_processes_store_all_of_their_entries(tmp_path: Path) -> None:
     script = (
-        "import sys; from pathlib import Path; from aerpaw_cmp.site.learned import Entry, remember;"
+        "import sys; from pathlib import Path; from aerpaw_cmp.site.learned import Entry, store_entry;"
         "site, who, entry = sys.argv[1:]; input();"
-        "[remember(Path(site), name, Entry.model_validate_json(entry.replace('A.', f'{name}.')),"
+        "[store_entry(Path(site), name, Entry.model_validate_json(entry.replace('A.', f'{name}.')),"
         " {f'{name}.{end}.csv.gz': b'table' for end in 'tu'}) for name in (f'{who}{i}' for i in range(20))]"
     )
     site, text = tmp_path / "mine.yaml", entry("A").model_dump_json()
@@ -379,7 +379,7 @@ def test_learned_antennas_are_found_from_any_working_folder(
     folder_of(folder / "mine.yaml").rename(folder / "rl" / "mine.learned")
     receiver = LearnedReceiver(tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=3.4e9, file="r.json.gz")
     ranked = entry("A").model_copy(update={"series": [], "receivers": [receiver]})
-    remember(folder / "rl" / "mine.yaml", "nr", ranked, {"r.json.gz": b"{}"})
+    store_entry(folder / "rl" / "mine.yaml", "nr", ranked, {"r.json.gz": b"{}"})
     path = flight(folder / "rl", {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"})
     path.write_text(path.read_text() + "rank: {receiver: mine/nr}\n", encoding="utf-8")
     monkeypatch.chdir(folder / where)
@@ -444,7 +444,7 @@ def test_a_table_edited_by_hand_is_refused_with_the_command_that_learns_it(folde
     assert "aerpaw-cmp calibrate c.yaml --into-site s.yaml" in caution.text
     with pytest.raises(InputError, match="is not the one that was learned"):
         all_learned_links(site)
-    remember(site, "d12", entry("A"), learned_tables("A"))
+    store_entry(site, "d12", entry("A"), learned_tables("A"))
     assert load_with_learned(flight(folder, {"LW1.A": "mine/d12_LW1.A"})).cautions == ()
 
 
@@ -462,10 +462,10 @@ def test_a_set_that_a_killed_calibration_left_is_repaired_by_learning_again(
     with monkeypatch.context() as patch:
         patch.setattr(memory, "write_whole", killed)
         with pytest.raises(KeyboardInterrupt):
-            remember(site, "d12", entry("A"), other)
+            store_entry(site, "d12", entry("A"), other)
     with pytest.raises(InputError, match="a calibration that was killed"):
         all_learned_links(site)
-    remember(site, "d12", entry("A"), other)
+    store_entry(site, "d12", entry("A"), other)
     assert len(all_learned_links(site)) == 1
 
 
@@ -474,7 +474,7 @@ def test_an_edited_value_is_refused_and_replaced_by_learning_again(folder: Path)
     index.write_text(index.read_text().replace("noise_sd_db: 0.0", "noise_sd_db: 3.0"))
     with pytest.raises(UsageError, match=r"learn it again: aerpaw-cmp calibrate c\.yaml"):
         read_learned(site)
-    remember(site, "d12", entry("A"), learned_tables("A"))
+    store_entry(site, "d12", entry("A"), learned_tables("A"))
     assert read_learned(site).entries["d12"].series[0].spread.noise_sd_db == 0.0
 
 
@@ -492,7 +492,7 @@ DAMAGES: dict[str, Callable[[str], str]] = {
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_index_is_refused_and_written_again_with_its_intact_entries(folder: Path, damage: str) -> None:
     site, index = folder / "mine.yaml", folder_of(folder / "mine.yaml") / "learned.yaml"
-    remember(
+    store_entry(
         site, "other", learned_entry(learned_series("B"), command="aerpaw-cmp calibrate o.yaml"), learned_tables("B")
     )
     index.write_text(DAMAGES[damage](index.read_text()))
@@ -500,15 +500,15 @@ def test_a_damaged_index_is_refused_and_written_again_with_its_intact_entries(fo
     intact["cut between entries"] = intact["cut"]
     with pytest.raises(UsageError, match=r"learn it again: (aerpaw-cmp calibrate|the calibration of other)"):
         read_learned(site)
-    (remark,) = memory.mend_remark(index.parent, ["d12"])
+    (remark,) = memory.damage_remark(index.parent, ["d12"])
     assert ("learn again: other (aerpaw-cmp calibrate o.yaml)" in remark) is (damage == "cut")
     assert ("learn again: other (the calibration of other)" in remark) is (damage == "cut between entries")
-    remember(site, "new", entry("C"), learned_tables("C"))
+    store_entry(site, "new", entry("C"), learned_tables("C"))
     assert read_learned(site).entries.keys() == {*intact.get(damage, {"other"}), "new"}
     (kept,) = index.parent.glob("learned.damaged*")
     assert kept.read_text() == before
     assert kept.name in remark
-    assert memory.mend_remark(index.parent, []) == []
+    assert memory.damage_remark(index.parent, []) == []
 
 
 def test_every_damaged_index_is_kept(folder: Path) -> None:
@@ -517,7 +517,7 @@ def test_every_damaged_index_is_kept(folder: Path) -> None:
     for damage in ("an open quote", "empty", "not text", "empty"):
         index.write_text(DAMAGES[damage](index.read_text()))
         contents.add(index.read_text())
-        remember(site, "other", learned_entry(learned_series("B")), learned_tables("B"))
+        store_entry(site, "other", learned_entry(learned_series("B")), learned_tables("B"))
     assert {kept.read_text() for kept in index.parent.glob("learned.damaged*")} == contents
     assert len(contents) == 3
 
@@ -541,7 +541,7 @@ def test_the_airframe_alone_states_the_error_of_held_out_campaigns(tmp_path: Pat
     def own_sd_db(end: str, **more: float) -> float:
         named_errors = Errors(**errors, **more) if more.pop("known", True) else None  # the last case has one flight
         made = learned_entry(learned_series("A", spread=spread), errors=named_errors)
-        remember(tmp_path / "mine.yaml", "e", made, learned_tables("A"))
+        store_entry(tmp_path / "mine.yaml", "e", made, learned_tables("A"))
         name = "mine/e_uav" if end == "uav" else "mine/e_LW1.A"
         return learned_antenna(find_named(name, tmp_path), end, 3.3e9)[1].spread.own_sd_db
 

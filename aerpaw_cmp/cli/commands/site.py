@@ -116,9 +116,9 @@ def site_show(
 
     shown = run.run_site_show(site, options)
     if not say.as_json:
-        from ...site.learned import memory_lines
+        from ...site.learned import learned_lines
 
-        for line in memory_lines(site):
+        for line in learned_lines(site):
             say(line)
     warn_all(shown.warnings)
     print_files(shown.files)

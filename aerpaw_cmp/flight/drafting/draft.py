@@ -1052,7 +1052,7 @@ def _carrier(
     tracks = [flown]
     for stream in (s for file in files for s in file.result.streams if s.kind == "telemetry" and s is not flown[0]):
         span = stream_span(stream)
-        if span is not None and meet(span, flown[1]) and _apart_m(stream, flown[0]) > _ONE_VEHICLE_M:
+        if span is not None and meet(span, flown[1]) and _median_distance_m(stream, flown[0]) > _ONE_VEHICLE_M:
             tracks.append((stream, span))
     if len(tracks) == 1:
         return flown, ""
@@ -1063,12 +1063,12 @@ def _carrier(
     sure = np.isfinite(evidence).all() and evidence[order[-1]] - evidence[order[-2]] > _SURE_OF_VEHICLE
     best = tracks[order[-1]] if sure else flown
     named = " and ".join(stream.name for stream, _ in tracks)
-    apart = max(_apart_m(stream, flown[0]) for stream, _ in tracks[1:])
+    apart = max(_median_distance_m(stream, flown[0]) for stream, _ in tracks[1:])
     fit = f", and the levels fit {best[0].name}" if sure else ""
     return best, f"{named} flew at this time, {apart:.0f} m apart{fit}: which of them carried the radio?"
 
 
-def _apart_m(first: Stream, second: Stream) -> float:
+def _median_distance_m(first: Stream, second: Stream) -> float:
     """Return the median distance of two tracks while both were logged [m], or 0 if it is unknown."""
     (time, place), (at, other) = (positions_over_time(stream.frame) for stream in (first, second))
     if len(time) < 2 or len(at) < 2:

@@ -79,7 +79,7 @@ class Occlusion:
         # pieces of each solid
         self.parts = [range(*ends) for ends in pairwise(np.searchsorted(solid, np.arange(len(starts) + 1)).tolist())]
         # True for each piece that touches another piece, of any solid
-        self.abutting = _abutting(footprint, tolerance_m)
+        self.abutting = _touching(footprint, tolerance_m)
 
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
         """Check whether polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
@@ -288,7 +288,7 @@ def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> lis
     ]
 
 
-def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
+def _touching(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
     """Check for each piece whether another piece is within the tolerance."""
     touched = np.zeros(len(footprints), dtype=np.bool_)
     if len(footprints) > 1:

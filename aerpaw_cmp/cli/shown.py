@@ -146,8 +146,8 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
     # escape before widths are measured, because an escape is longer than the character
     rows = [[one_line(cell) for cell in row] for row in rows]
     columns, title = [one_line(name) for name in columns], title and one_line(title)
-    # without a terminal, rich uses 80 columns
-    console = Console(width=width if width or sys.stdout.isatty() else 160)
+    # without a terminal, rich uses 80 columns; it would read [words] in a log or a unit as styles
+    console = Console(width=width if width or sys.stdout.isatty() else 160, markup=False)
     needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
     # 3 is the width of a border and a space on each side of a cell
     roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
@@ -158,9 +158,18 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
     for column, need in zip(columns, needs, strict=True):
         table.add_column(column, overflow="fold", width=None if roomy or need > _FIXED else need)
     for row in rows:
-        # rich would read [words] in a log as styles
-        table.add_row(*[cell.replace("[", r"\[") for cell in row])
+        table.add_row(*row)
     console.print(table)
+
+
+def page_table(item: Any) -> None:
+    """Print a table of a page (:class:`~aerpaw_cmp.report.cards.Table`), or nothing if it has no rows."""
+    from ..report.cards import cell
+
+    forms = item.columns.values()
+    rows = [[str(cell(value, form)) for value, form in zip(row, forms, strict=True)] for row in item.rows]
+    if rows:
+        table(list(item.columns), rows, item.caption)
 
 
 def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, width: int) -> None:

@@ -193,13 +193,10 @@ def _dimensions(item: Any) -> list[str]:
 
 def _plain(values: AnyArray) -> AnyArray:
     """Return an array that does not require pickle: rows of characters and texts become arrays of text."""
-    if values.dtype.kind == "S" and values.dtype.itemsize == 1 and values.ndim:
-        joined = [
-            b"".join(row).decode("utf-8", "replace").rstrip("\0 ") for row in values.reshape(-1, values.shape[-1])
-        ]
-        return np.array(joined, dtype=np.str_).reshape(values.shape[:-1])
+    if values.dtype == "S1" and values.size and values.ndim:
+        values = np.ascontiguousarray(values).view(f"S{values.shape[-1]}")[..., 0]
     if values.dtype.kind in "SO":
-        words = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.ravel()]
+        words = [str(_text(value)).rstrip("\0 ") for value in values.ravel()]
         return np.array(words, dtype=np.str_).reshape(values.shape)
     return values
 

@@ -231,12 +231,7 @@ class TrackAccount:
             (self.gaps, "telemetry gap", f"(the longest {self.longest_gap_s:.1f} s): not interpolated"),
             (self.unknown_attitude, "telemetry row", "without attitude: level flight along the course is assumed"),
             (self.heading_alone, "telemetry row", "with only a heading: level flight in its direction is assumed"),
-            (
-                self.below_ground,
-                "telemetry row",
-                "below the site's ground plane: not compared. origin.takeoff_ground_m, or an elevation model, "
-                "specifies the height of the ground",
-            ),
+            (self.below_ground, "telemetry row", "below the site's ground: not compared (origin.takeoff_ground_m)"),
         )
         usual_m, high_m = self.sparse_error_m
         sparse = (

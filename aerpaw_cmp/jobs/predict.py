@@ -196,7 +196,7 @@ def _model_fields(
         base = "prior" if isinstance(model, Prior) else "memory"
         fields["chosen"] = {"title": pages.TITLES[base], "base": base, "corrected": False, "field": OFF}
     if isinstance(model, Prior):
-        origin = pages.prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
+        origin = pages.PRIOR.format(carrier=model.link.carrier_hz / 1e9, power=model.link.transmit_power_dbm)
         verdict = pages.first_sentences(None, 0.0, *expected, origin=origin)
         off = outside_area(table[["east_m", "north_m"]].to_numpy(np.float64), model.site).mean()
         return fields | {"verdict": verdict, "warnings": pages.prior_cautions(PRIOR_SD_DB, float(off))}

@@ -266,7 +266,7 @@ def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption
 
 def referee_card(data: ReportData) -> Card:
     """Return the card that compares predictions of other programs with ray tracing and the baselines."""
-    parts = [_prediction_card(verdict) for verdict in data.extra_metrics.get("referee", ())]
+    parts = [prediction_card(verdict) for verdict in data.extra_metrics.get("referee", ())]
     text = (
         "Every model is scored on the samples that the prediction covers. Fitted on this flight: one offset per model "
         "and channel."
@@ -274,7 +274,7 @@ def referee_card(data: ReportData) -> Card:
     return Card(title="Predictions of other programs", id="referee", text=[text] if parts else [], parts=parts)
 
 
-def _prediction_card(verdict: Mapping[str, Any]) -> Card:
+def prediction_card(verdict: Mapping[str, Any]) -> Card:
     """Return the card of one prediction: means over channels, then each channel."""
     name = verdict["prediction"]
     series = [(" ".join(link).strip(), entry) for link, entry in links_of(verdict["levels"]).items()]
@@ -319,7 +319,7 @@ def _prediction_card(verdict: Mapping[str, Any]) -> Card:
     return Card(
         title=name,
         text=[paragraph(bold(verdict["sentence"])), *verdict["remarks"]],
-        tables=[means, nodes, _exceedance_table(name, series), ranks],
+        tables=[means, nodes, ranks, _exceedance_table(name, series)],
         parts=[Card(title=f"{name}, channel by channel", tables=[channels], fold=True)],
     )
 

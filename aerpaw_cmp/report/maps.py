@@ -702,8 +702,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
         title=data.title,
         site={"name": data.site.name, "credit": data.site.credit, "assumed": data.site.assumed},
         grid={"columns": columns, "rows": rows, "positions": columns * rows},
-        coverage=[{"tower": m.tower, "antennas": m.antennas, "foliage": m.foliage, "altitude_m": m.height_m,
-                   "coverage": m.coverage} for m in data.rss],
+        coverage=coverage_rows(data),
         rank=[{"k": m.k, "foliage": m.foliage, "altitude_m": m.height_m,
                "share": dict(zip(RANK_CLASSES, m.share, strict=True))} for m in data.rank],
         layers=[layer_numbers(layer) for layer in page_layers(data)],
@@ -726,23 +725,32 @@ def result_card(data: MapsData) -> Card:
         columns={"Where": HEAD, "What": TEXT, "Paper": TEXT, "Here": TEXT, "Figure": TEXT},
         rows=[(p.where, p.what, p.paper, p.ours, p.figure) for p in data.paper],
     )
-    return Card(title="Result", id="result", link="Result", tables=[coverage_table(data), paper])
+    return Card(title="Result", id="result", link="Result", tables=[coverage_table(coverage_rows(data)), paper])
 
 
-def coverage_table(data: MapsData) -> Table:
-    """Return the table of shares in coverage by height. Heights with 100.0 % everywhere share one row."""
-    heights = sorted({m.height_m for m in data.rss})
+def coverage_rows(data: MapsData) -> list[dict[str, Any]]:
+    """Return the shares in coverage as in metrics.json."""
+    return [
+        {"tower": m.tower, "antennas": m.antennas, "foliage": m.foliage, "altitude_m": m.height_m,
+         "coverage": m.coverage}
+        for m in data.rss
+    ]  # fmt: skip
+
+
+def coverage_table(shares: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table of shares in coverage by height. Rows with 100.0 % at all heights share one row."""
+    heights = sorted({m["altitude_m"] for m in shares})
+    alone = len({m["tower"] for m in shares}) == 2  # a single tower is always the nearest tower
     rows: list[Sequence[str | None]] = []
-    full = 0
-    for key, maps in grouped(data.rss, lambda m: (m.antennas, m.foliage, m.tower)).items():
-        share = {m.height_m: percent(m.coverage, 1) for m in maps}
-        if set(share.values()) == {percent(1.0, 1)}:
-            full += 1
-        else:
+    for key, maps in grouped(shares, lambda m: (m["antennas"], m["foliage"], m["tower"])).items():
+        share = {m["altitude_m"]: percent(m["coverage"], 1) for m in maps}
+        if not (alone and key[2] == JOINT):
             rows.append((*key, *(share.get(height) for height in heights)))
-    if full:
-        whose = f"the other {counted(full, 'row')}" if rows else "every antenna, foliage and tower"
-        rows.append((whose, "", "", *[percent(1.0, 1)] * len(heights)))
+    everywhere = [percent(1.0, 1)] * len(heights)
+    partial = [row for row in rows if [*row[3:]] != everywhere]
+    if (full := len(rows) - len(partial)) > 1:
+        whose = f"the other {counted(full, 'row')}" if partial else "every antenna, foliage and tower"
+        rows = [*partial, (whose, "", "", *everywhere)]
     columns = {"Antennas": TEXT, "Foliage": TEXT, "Tower": HEAD, **{f"{height:g} m": RIGHT for height in heights}}
     caption = f"Share of positions in coverage. {ANTENNAS} Joint: the nearest tower serves."
     return Table(caption=caption, columns=columns, rows=rows)

@@ -85,6 +85,10 @@ EXPECTED = (
 NOWHERE = "No level is predicted: no path reaches any of the points."
 LOCK = "The receiver is in lock for {percent:.0f} % of them (P(lock) of each point: `p_lock` in prediction.csv)."
 REMEMBERED = "No flight is named: antennas and levels are those learned at this site."
+PRIOR = (
+    "No flight is known: ray tracing with isotropic antennas, {carrier:g} GHz, {power:g} dBm transmitted. Next: fly "
+    "once, then `aerpaw-cmp predict --with flight.yaml`."
+)
 OUTSIDE = {
     "flown": "{percent:.0f} % of the points are outside the flown area.",
     "site": "{percent:.0f} % of the points are outside the area of the site (`area_m`), where the map may end.",
@@ -175,14 +179,6 @@ def stored_model_notes(known: Sequence[tuple[Entry, LearnedSeries]]) -> list[str
     """Return sentences about the learned models of the site that a prediction without flights uses."""
     each = lists_by_key((entry.about(), f"{series.tower} {series.channel}") for entry, series in known)
     return [f"{', '.join(names)}: {about}." for about, names in each.items()]
-
-
-def prior_words(carrier_hz: float, power_dbm: float) -> str:
-    """Return the sentence about a prediction before any flight."""
-    return (
-        f"No flight is known: ray tracing with isotropic antennas, {carrier_hz / 1e9:g} GHz, {power_dbm:g} dBm "
-        "transmitted. Next: fly once, then `aerpaw-cmp predict --with flight.yaml`."
-    )
 
 
 def prior_cautions(sd_db: Mapping[str, float], beyond: float) -> list[str]:

@@ -16,7 +16,7 @@ from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.jobs import referee
-from aerpaw_cmp.report.flight import _prediction_card
+from aerpaw_cmp.report.flight import prediction_card
 
 PREDICTIONS = Path(__file__).parents[1] / "predictions"
 pytestmark = pytest.mark.usefixtures("blank_pictures")
@@ -124,9 +124,11 @@ def test_a_copy_of_our_levels_in_three_formats_scores_as_ours_do(flight: Path) -
     xarray = pytest.importorskip("xarray")
     wide = by_time[by_time["channel"] == "USRP1"].pivot(index="time_utc", columns="tower", values="level_dbm")
     times = pd.to_datetime(wide.index.to_numpy()).tz_localize(None)
-    for clock in ("time", "time_utc"):
-        given = {clock: times, "tower": list(wide.columns)}
-        xarray.Dataset({"level_dbm": ((clock, "tower"), wide.to_numpy())}, given).to_netcdf(flight / f"{clock}.nc")
+    for clock, letters in (("time", {"dtype": "S1"}), ("time_utc", {})):  # rows of characters, or texts
+        given = xarray.Dataset(
+            {"level_dbm": ((clock, "tower"), wide.to_numpy())}, {clock: times, "tower": wide.columns}
+        )
+        given.to_netcdf(flight / f"{clock}.nc", encoding={"tower": letters})
     names = ["matlab.csv", "loss.csv", "time.nc", "time_utc.nc"]
     cards = scored(flight, *(flight / name for name in names), near="0.01")
     assert [card["prediction"] for card in cards] == names
@@ -342,7 +344,7 @@ def test_the_page_states_the_log_score_of_predicted_ranks_beside_their_own_row()
     score = {"kappa": 0.2, "total_variation": 0.1, "agreement": 0.5}
     ranks = {"matched": 30, "log_score": 1.25, "constant_log_score": 1.5}
     scores = {"ours.csv": score, "ray tracing, K = 10": score}
-    card = _prediction_card({
+    card = prediction_card({
         "prediction": "ours.csv", "sentence": "", "remarks": [], "means": [], "levels": {}, "nodes": [],
         "rank": {"LW1": {**ranks, "scores": scores}},
     })  # fmt: skip

@@ -104,7 +104,7 @@ def test_borders_only_where_towers_share_the_area(maps_data):
 
 
 def test_tables(maps_data):
-    coverage = maps_html.coverage_table(maps_data)
+    coverage = maps_html.coverage_table(maps_html.coverage_rows(maps_data))
     assert list(coverage.columns)[3:] == ["30 m", "70 m", "110 m"]
     assert len(coverage.rows) == 12
     assert coverage.rows[5][:3] == ("SISO", "opaque", "joint")
@@ -122,7 +122,8 @@ def test_tables(maps_data):
 def test_rows_in_full_coverage_are_one(maps_data, all_full):
     """A map in which every path arrives does not distinguish the towers."""
     full = [dataclasses.replace(m, coverage=1.0 if all_full or m.tower != "LW4" else 0.98765) for m in maps_data.rss]
-    rows = maps_html.coverage_table(dataclasses.replace(maps_data, rss=tuple(full))).rows
+    shares = maps_html.coverage_rows(dataclasses.replace(maps_data, rss=tuple(full)))
+    rows = maps_html.coverage_table(shares).rows
     towers = len({m.tower for m in full})
     whose = "every antenna, foliage and tower" if all_full else f"the other {2 * (towers - 1)} rows"
     assert [row[0] for row in rows] == ([whose] if all_full else ["SISO", "MIMO", whose])

@@ -12,7 +12,7 @@ from ...common.errors import typed
 from ...common.text import counted
 from ...jobs.options import AGAINST_DISTANCE_M, RunOptions
 from ..app import Figures, Force, command, of_run, output
-from ..shown import answered, number, print_files, records, say, show, table, warn_all
+from ..shown import answered, number, page_table, print_files, records, say, show, table, warn_all
 
 
 @command(
@@ -77,23 +77,6 @@ def report(
     return max(_verdict(outcome, strict), _nothing_compared(outcome.metrics), refused)
 
 
-def _print_cards(verdict: Mapping[str, Any]) -> None:
-    """Print the sentence and the table of a third-party prediction."""
-    show(verdict["sentence"])
-    columns = {
-        "model": "model", "channels": "channels", "bias dB": "bias_db:.1f", "RMSE dB": "rmse_db:.1f",
-        "after offset": "rmse_offset_db:.1f", "1 s": "rmse_1s_db:.1f", "CRPS dB": "crps_db:.2f",
-        "inside 90 %": "coverage_90:.0%",
-    }  # fmt: skip
-    title = f"{verdict['prediction']} and other models on the same samples, means over channels (each in card.json)"
-    records(verdict["means"], columns, title)
-    columns = {"channel": "series", "offset dB": "offset_db:.1f", "slope": "slope:.2f", "floor dB": "floor_db:.1f"}
-    title = "Offset (added to the measurement), slope of measured over predicted level, detection floor"
-    records(verdict["nodes"], columns, title)
-    for remark in verdict["remarks"]:
-        say.warn(remark)
-
-
 def _nothing_compared(metrics: Mapping[str, Any]) -> int:
     """Return 1 and warn if no channel and no rank has enough samples to compare, otherwise 0."""
     from ...compare.statistics import FEWEST
@@ -144,6 +127,7 @@ def _print_report_summary(outcome: Any) -> None:
     """Print the summary of the page first, then its tables."""
     from ...compare.result import BASELINE_TITLE
     from ...compare.statistics import FEWEST
+    from ...report.flight import prediction_card
 
     show(" ".join([outcome.metrics["sentence"], *outcome.metrics["offsets"]]))
     links = [
@@ -171,7 +155,11 @@ def _print_report_summary(outcome: Any) -> None:
     records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
     _print_forecasts(outcome.metrics["rank"])
     for verdict in outcome.metrics.get("referee", []):
-        _print_cards(verdict)
+        show(verdict["sentence"])
+        for item in prediction_card(verdict).tables[:3]:
+            page_table(item)
+        for remark in verdict["remarks"]:
+            say.warn(remark)
     for text in outcome.metrics["antennas"]:
         show(text)
     warn_all(outcome.metrics["warnings"])

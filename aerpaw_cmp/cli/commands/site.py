@@ -10,7 +10,7 @@ from typer import Argument, Option
 from ...common.errors import UsageError
 from ...jobs.options import RunOptions
 from ..app import Figures, Flights, Force, antenna_app, command, of_run, output, site_app
-from ..shown import answered, print_files, records, say, show, table, warn_all
+from ..shown import answered, page_table, print_files, say, show, table, warn_all
 
 
 @command(
@@ -204,6 +204,7 @@ def map_(
     """Map coverage and rank of a site."""
     from ...jobs import run
     from ...jobs.coverage_map import map_settings
+    from ...report.maps import coverage_table
 
     chosen: dict[str, Any] = {
         "foliage": None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage)),
@@ -229,26 +230,10 @@ def map_(
     if answered(outcome.metrics):
         return
     if settings.budget.level_dbm is not None:
-        _print_coverage(outcome.metrics["coverage"], settings)
+        page_table(coverage_table([m for m in outcome.metrics["coverage"] if m["foliage"] == settings.shown]))
     rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
     if rows:
         table(["where", "what", "paper", "here"], rows, "Values of the paper and of this run")
     for path in outcome.files:
         if path.parent == outcome.folder:
             show(path)
-
-
-def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
-    """Print the share of covered positions per tower, antennas and height, for the foliage model of the paper."""
-    from ...maps.grid import JOINT
-    from ...report.maps import ANTENNAS
-
-    lines: dict[tuple[str, str], dict[str, str]] = {}
-    alone = len({row["tower"] for row in rows}) == 2  # a single tower is always the nearest tower
-    for row in (row for row in rows if row["foliage"] == settings.shown and not (alone and row["tower"] == JOINT)):
-        tower = "nearest tower" if row["tower"] == JOINT else row["tower"]
-        line = lines.setdefault((tower, row["antennas"]), {"tower": tower, "antennas": row["antennas"]})
-        line[f"{row['altitude_m']:g} m"] = f"{100.0 * row['coverage']:.1f} %"
-    columns = {name: name for line in lines.values() for name in line}
-    records(list(lines.values()), columns, f"Covered positions, foliage {settings.shown}")
-    show(ANTENNAS)

@@ -119,6 +119,9 @@ def test_a_table_too_wide_for_the_terminal_is_text_without_broken_numbers(capsys
         assert max(map(len, shown.splitlines())) <= width
         assert all(shown.count(cell) == 2 for cell in (file, "sounder_log", "123450"))
         assert shown.count("2025-06-01 14:00:00") == 2
+    table(["Bias [dB]"], [["[1, 2]"]], "log score [nat]")
+    shown = capsys.readouterr().out
+    assert all(text in " ".join(shown.split()) for text in ("Bias [dB]", "[1, 2]", "[nat]"))
 
 
 @pytest.mark.parametrize(("error_db", "explained"), [(3.25, False), (None, True)])

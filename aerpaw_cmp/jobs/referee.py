@@ -350,7 +350,8 @@ def _checked(frame: pd.DataFrame, data: FlightData) -> tuple[str, pd.DataFrame]:
     table["time"] = _times(given)
     table[list(_PLACE)] = _places(given, data.site)
     if table["time"].isna().all() and table["east_m"].isna().all():
-        raise InputError(f"rows without a time and without a position {columns}", expected=_EXPECTED)
+        found, cause = f"rows without a time and without a position {columns}", "other names of columns, or no values"
+        raise InputError(found, expected=_EXPECTED, cause=cause)
     _check_numbers(table, quantity)
     if quantity == "path_loss_db":
         # a large loss is a low level, so swap the ends of the band
@@ -700,7 +701,9 @@ def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightRes
     corrected = {datum: points - apart_m * (1.0 - flat), "heights in feet": ground + (points - ground) * [1, 1, FOOT_M]}
     shares = {cause: nearest_points(flown, at, given.near_m)[1].mean() for cause, at in corrected.items()}
     cause = max(corrected, key=shares.__getitem__)
-    return cause if shares[cause] > 0.5 else None
+    more = shares[cause] - nearest_points(flown, points, given.near_m)[1].mean()
+    # a map may cover only a part of the route, but routes that only cross are no evidence of wrong heights
+    return cause if more > max(0.5 * near.mean(), 0.1) else None
 
 
 def _other_time(given: ForeignPrediction, result: FlightResult) -> str:

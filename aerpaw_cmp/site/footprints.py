@@ -41,6 +41,7 @@ from .siteyaml import (
     SiteModel,
     build_site,
     extent_m,
+    misread,
     site_model,
 )
 
@@ -358,7 +359,7 @@ def _check_place(content: mapfiles.MapFile, frame: SiteFrame) -> None:
     if math.isfinite(away):
         found = f"the nearest position is {away / 1000:.0f} km from the site"
     causes = (
-        (_distance_m(longitude, latitude, frame).min() <= FAR_M, "latitude and longitude are swapped"),
+        *((_distance_m(*at, frame).min() <= FAR_M, cause) for cause, at in misread(latitude, longitude).items()),
         (max(spans, default=0) > 180, "the area crosses the antimeridian (180 deg)"),
         (not math.isfinite(away), "metres or feet instead of degrees"),
         (True, "a map of another place"),

@@ -253,7 +253,7 @@ def test_levels_of_a_twin_have_offset_slope_and_floor(cards: dict[str, dict]) ->
         (lambda f: pd.concat([f, f.assign(level_dbm=-50.0)]), "with several levels at one time"),
         (lambda f: f.assign(p_rank1=40.0, p_rank2=60.0), "Likely cause: percent, or counts of samples"),
         (lambda f: f.drop(columns="tower"), "no column tower"),
-        (lambda f: f.drop(columns="time_utc"), "without a time and without a position"),
+        (lambda f: f.drop(columns="time_utc"), "Likely cause: other names of columns, or no values"),
         (
             lambda f: f.drop(columns="time_utc").assign(latitude_deg=-78.696, longitude_deg=35.7275, height_m=30.0),
             "latitude and longitude are swapped",
@@ -274,7 +274,8 @@ def test_levels_of_a_twin_have_offset_slope_and_floor(cards: dict[str, dict]) ->
             "times that cannot be read, such as 01-Jun-2025",
         ),
         (
-            lambda f, place: f.join(place.add([0.0, 0.0, 95.0])).drop(columns="time_utc").drop_duplicates(place.columns),
+            # a part of the route
+            lambda f, p: f.join(p.add([0.0, 0.0, 95.0])).drop(columns="time_utc").drop_duplicates(p.columns).head(130),
             "another height datum: the predicted positions are 95 m above the flight",
         ),
     ],

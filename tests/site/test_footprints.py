@@ -243,6 +243,8 @@ def test_swapped_far_and_antimeridian(tmp_path: Path) -> None:
     swapped = [(lat, lon) for lon, lat in lonlat(square(0, 0))]
     with pytest.raises(InputError, match="latitude and longitude are swapped"):
         import_footprints([raw(tmp_path / "s.json", *swapped)], FRAME)
+    with pytest.raises(InputError, match="the sign of the longitude is wrong: west is negative"):
+        import_footprints([raw(tmp_path / "e.json", *((-lon, lat) for lat, lon in swapped))], FRAME)
     with pytest.raises(InputError, match=r"\d+ km from the site.*a map of another place"):
         import_footprints([raw(tmp_path / "p.json", (2.0, 48.0), (2.1, 48.0), (2.1, 48.1))], FRAME)
     with pytest.raises(InputError, match=r"antimeridian"):

@@ -2,7 +2,7 @@
 
 The module also reads the training logs that a learned file lists by their SHA-256 and their fingerprints (``marks``).
 
-No learned model is scored on its training logs. The name, folder or archive of a log may change. It is therefore
+No learned model is scored on its training logs. The name, folder or archive of a log may change. A log is therefore
 identified by its SHA-256, or by its fingerprints if its bytes were changed (:mod:`aerpaw_cmp.flight.training`).
 """
 

@@ -69,7 +69,7 @@ def cache_folder(*parts: str) -> Path:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for one process at a time. This has no effect on systems and disks without locks."""
+    """Lock a folder for one process at a time. The lock has no effect on systems and disks without locks."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         # Windows has no fcntl, and some network disks have no locks
@@ -89,12 +89,13 @@ def atomic_path(target: Path) -> Iterator[Path]:
     Parameters
     ----------
     target : Path
-        The output file. Its folder must exist. Other programs see the old file or the new one, never a part.
+        The output file. The folder of the file must exist. Other programs see the old file or the new one, never a
+        part.
 
     Yields
     ------
     Path
-        An empty file in the same folder. It is removed if the block fails.
+        An empty file in the same folder. The file is removed if the block fails.
 
     Raises
     ------
@@ -195,8 +196,8 @@ def unseal(entry: bytes, mark: bytes) -> bytes:
     Raises
     ------
     ValueError
-        If the entry is damaged or another kind of file. This is checked before parsing, because readers of damaged
-        archives raise many kinds of exceptions.
+        If the entry is damaged or another kind of file. The SHA-256 is checked before parsing, because readers of
+        damaged archives raise many kinds of exceptions.
     """
     content, end = entry[: -len(mark) - 32], entry[-len(mark) - 32 :]
     if end != mark + hashlib.sha256(content).digest():

@@ -8,7 +8,7 @@ output is renamed, and delays it during steps that must not be split.
 A call of compiled code (LLVM, linear algebra, Sionna) may last for minutes, during which Python handles no signals. A
 second thread then ends the process.
 
-scancel, systemd and docker send SIGTERM, and a closed terminal sends SIGHUP. Both end a command as Ctrl-C does.
+scancel, systemd and docker send SIGTERM, and a closed terminal sends SIGHUP. Both signals end a command as Ctrl-C does.
 
 A standard stream that is closed, full or gone is not treated as a bug of the program.
 

@@ -13,9 +13,9 @@ An input is never replaced, with or without ``--force``. Inputs are compared by 
 recognised. Files that this tool did not write, or that were changed afterwards, are replaced only with ``--force``.
 
 The hidden path next to the target (``.NAME.aerpaw-part``) is created before any computation, so that a bad ``-o`` is
-reported first. It is locked (flock) until the run ends: a second run into the same target is refused. A killed run
-leaves at most that hidden path, and the next run into the target removes it. See docs/security.md for the exact
-guarantees.
+reported first. The hidden output is locked (flock) until the run ends: a second run into the same target is refused. A
+killed run leaves at most that hidden path, and the next run into the target removes it. See docs/security.md for the
+exact guarantees.
 
 The module also contains a stream that HDF5 can write to.
 """
@@ -394,7 +394,7 @@ class OutputFolder:
 
     @contextlib.contextmanager
     def filling(self) -> Iterator[Path]:
-        """Yield an empty folder for the results. It takes the target's name if the block ends without an error."""
+        """Yield an empty folder for results. The folder takes the target's name if the block ends without an error."""
         place = self._place
         assert place is not None, "used as a context"
         with explained_os_errors(self.named):

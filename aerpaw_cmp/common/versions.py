@@ -19,7 +19,7 @@ NOT_INSTALLED = "not installed"
 
 @cache
 def version(package: str) -> str:
-    """Return the version of an installed package, else "not installed". Its metadata is read once."""
+    """Return the version of an installed package, else "not installed". The metadata of each package is read once."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

@@ -8,7 +8,7 @@ expand to more than :data:`_MAX_NODES` nodes and nesting deeper than :data:`_MAX
 
 Values of some keys can be edited in a YAML file: every other line, its comments and its order stay unchanged.
 
-The module also lists the files that a settings file names. These are inputs, which no output may replace.
+The module also lists the files that a settings file names. Such files are inputs, which no output may replace.
 
 There is no list of keys: every text that names an existing file counts, so that a new key is not forgotten.
 """

@@ -3,8 +3,9 @@
 Learned antennas are scored on held-out flights, heights, sectors and headings.
 
 A prediction has a *base*, which predicts levels above free space: a constant level, free space, a replay or learned
-antennas. Its *correction* is the residual field (:mod:`.field_gp`) of the base. Both are chosen by the CRPS on held-out
-flights, or on blocks of a single flight. There is no correction unless a 95 % interval shows that it lowers the CRPS.
+antennas. Its *correction* is the residual field (:mod:`.field_gp`) of the base. Base and correction are chosen by the
+CRPS on held-out flights, or on blocks of a single flight. There is no correction unless a 95 % interval shows that it
+lowers the CRPS.
 """
 
 from __future__ import annotations
@@ -431,7 +432,7 @@ def parts_left_out(
         Samples of all flights.
     recipe : Recipe
     without : mapping of str to Learned
-        Learned gains by held-out flight. Their strengths are not fitted again.
+        Learned gains by held-out flight. The strengths of these gains are not fitted again.
     parts : callable
         :func:`altitude_parts`, :func:`heading_parts` or :func:`sector_parts`.
 
@@ -590,7 +591,7 @@ class Correction:
     channels : mapping of str to Channel
         Channels by antenna (``tower.channel``).
     flights : tuple of str
-        Names of the flights. Their indices are the flight codes of :class:`Rows`.
+        Names of the flights. The index of a flight is its code in :class:`Rows`.
     crps_db, rmse_db : mapping of (base, title) to float
         CRPS and RMSE of held-out errors.
     held_out : mapping of (base, title) to ((n,), (n,))

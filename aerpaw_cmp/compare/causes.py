@@ -881,7 +881,7 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield levels with half or twice the decibels (amplitude read as power, or vice versa), or the opposite sign.
+    """Yield trials in which all levels in dB are halved, doubled (amplitude read as power, or vice versa) or negated.
 
     The interval of the slope must support the factor, and a path-loss exponent and a gain over elevation, which change
     levels in the same way, must be much less likely than the factor.

@@ -176,7 +176,7 @@ def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
 
 
 def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
-    """Return a group number for each second. It stays the same while the UAV neither moves nor turns."""
+    """Return a group number for each second. The number stays the same while the UAV neither moves nor turns."""
     azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
     flat = np.cos(elevation)
     towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])

@@ -391,8 +391,8 @@ class FlownFlights:
         Parameters
         ----------
         route : sequence of LinkSamples
-            Samples of the planned flight at each antenna. Their levels are not used. It is empty if no flight is
-            planned.
+            Samples of the planned flight at each antenna. The levels of these samples are not used. The sequence is
+            empty if no flight is planned.
         targets : mapping of str to LinkSamples
             Targets by antenna.
 

@@ -7,8 +7,8 @@ The gain over direction at both ends of a link is learned from the residuals of 
 ``offset`` is free per flight, tower and channel. ``own`` is an error of each flight and channel that is correlated over
 position (the nuisance), so that the shadowing of one flight is not learned as antenna gain. The gains are Gaussian
 processes. The gain of the UAV depends on the direction of the tower in the body frame, and the gain of the tower on the
-direction of the UAV at the mast. The third gain depends on both directions. It is separate for each channel and
-contains what the first two do not explain.
+direction of the UAV at the mast. The third gain depends on both directions, is separate for each channel, and contains
+what the first two do not explain.
 
 For antennas with a known pattern, the azimuths of their mounts at both ends are fitted to several flights together.
 
@@ -332,7 +332,7 @@ def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> Floa
 
 
 def _with_blocks(covariance: FloatArray, blocks: Iterable[FloatArray]) -> FloatArray:
-    """Add the covariance of each series to its diagonal block. This is done in place, because the matrix is large."""
+    """Add the covariance of each series to its diagonal block. The matrix is changed in place, because it is large."""
     start = 0
     for block in blocks:
         part = slice(start, start + len(block))
@@ -963,7 +963,7 @@ def inside_shares(error_db: FloatArray, stated: StatedSpread) -> dict[str, float
 def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float]:
     """Return standard deviation [dB] and excess kurtosis of samples about their means over bins.
 
-    Both are 0 if no bin has two samples.
+    Both numbers are 0 if no bin has two samples.
 
     Examples
     --------

@@ -236,8 +236,8 @@ class Step:
 def step_chi2(time_s: FloatArray, error_db: FloatArray, *, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return times (m,), chi-squared (m,) and sizes (m,) [dB] of possible steps, by generalised least squares.
 
-    The last elements are slower changes, over 100 and 200 s around each time, and over the whole flight. Their time is
-    NaN.
+    The last elements are slower changes, over 100 and 200 s around each time, and over the whole flight. The time of a
+    slower change is NaN.
 
     Notes
     -----

@@ -1,6 +1,6 @@
 """Comparison of measured levels with predictions: RSS, detection, serving cells and scores.
 
-The functions take arrays in time order, with one value per sample and NaN for a missing value. They do not depend on
+The functions take arrays in time order, with one value per sample and NaN for a missing value. No function depends on
 files, sites or engines.
 
 The module compares the measured and simulated signal strength of one tower and channel, and scores predictions after a
@@ -519,7 +519,8 @@ class DetectionForecast:
     per_db : float
         Slope of the log odds.
     share : float
-        Share of detected samples, averaged over the flights. It is the forecast for samples without a predicted level.
+        Share of detected samples, averaged over the flights. This share is the forecast for samples without a predicted
+        level.
     """
 
     level_db: float
@@ -695,8 +696,8 @@ def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> Fl
 def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:
     """Return the offset with the smallest RMSE after both levels (n,) are raised to at least the floor.
 
-    Pairs with a NaN are ignored. The offset is added to the measurement. It is searched within 60 dB of the median
-    difference of levels above the floor.
+    Pairs with a NaN are ignored. The offset is added to the measurement. The offset is searched within 60 dB of the
+    median difference of levels above the floor.
     """
     finite = np.isfinite(measured_db) & np.isfinite(simulated_db)
     order = np.flatnonzero(finite)[np.argsort(simulated_db[finite])]
@@ -870,7 +871,7 @@ def nearest_points(
     reach_m : float
         Largest distance of a near point.
     nose_deg : ((n,), (points,)), optional
-        Headings of samples and points. They are used only if all points and at least one sample have a heading.
+        Headings of samples and points. Headings are used only if all points and at least one sample have one.
 
     Returns
     -------

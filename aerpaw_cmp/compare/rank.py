@@ -1,7 +1,7 @@
 """The rank of a channel, and the comparison of two sequences of ranks.
 
 The rank is the number of singular values strictly above ``sigma_1 / K``. Rank 0 means that there is no channel. The
-measured RI is a float. It is NaN if the modem reported no CSI, and never 0.
+measured RI is a float: NaN if the modem reported no CSI, and never 0.
 """
 
 from __future__ import annotations
@@ -222,8 +222,8 @@ def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
 def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     """Return Cohen's kappa: the agreement beyond chance, given both histograms.
 
-    Kappa is 1 if the ranks are always equal, and 0 if they agree as often as by chance. It is NaN without a pair, and
-    for two equal constants. Cohen (1960), doi:10.1177/001316446002000104.
+    Kappa is 1 if the ranks are always equal, and 0 if they agree as often as by chance. Kappa is NaN without a pair,
+    and for two equal constants. Cohen (1960), doi:10.1177/001316446002000104.
 
     Examples
     --------
@@ -558,8 +558,8 @@ def _histogram_intervals(rank: FloatArray, place_m: FloatArray | None = None) ->
 def compare_ranks(measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray | None = None) -> RankFit:
     """Compare two sequences of ranks by pose and by histogram.
 
-    The histogram distances compare all measured with all simulated ranks. Their intervals come from poses that have
-    both.
+    The histogram distances compare all measured with all simulated ranks. The intervals come from poses that have both
+    ranks.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Forecasts of the rank that a receiver reports, and its decision, learned from flights.
 
-A forecast contains a probability for each rank. It is scored by the log score, which is a proper score, and compared
-with the constant forecast (the histogram of the training flights). The rank that is decided from the probabilities is
-scored by kappa and agreement. It is compared with the most frequent rank.
+A forecast contains a probability for each rank. A forecast is scored by the log score, which is a proper score, and
+compared with the constant forecast (the histogram of the training flights). The rank that is decided from the
+probabilities is scored by kappa and agreement. The decided rank is compared with the most frequent rank.
 
 A receiver chooses the rank with the largest throughput at its noise level. Logs contain neither its codebook nor its
 channel estimate. The module therefore learns how often each rank is reported, given the level and the ratios of

@@ -63,8 +63,8 @@ def level_card(
         - ``n``: number of samples with a measured and a predicted level.
         - ``bias_db rmse_db``: mean of measured minus predicted and RMSE, without an offset. None if the levels have no
           common reference.
-        - ``offset_db rmse_offset_db``: offset that is added to the measurement, and RMSE after this offset. It is
-          fitted on the scored samples.
+        - ``offset_db rmse_offset_db``: offset that is added to the measurement, and RMSE after this offset. The offset
+          is fitted on the scored samples.
         - ``rmse_1s_db``: RMSE of means over 1 s, with a separate offset.
         - ``correlation slope``: Pearson correlation, and slope of measured over predicted level (least squares). NaN
           if the prediction is constant.

@@ -239,7 +239,7 @@ class RssResult:
 
     @property
     def training(self) -> bool:
-        """True if the antennas were learned from the logs of this series. Such a series is not scored."""
+        """True if the antennas were learned from the logs of this series. A series with such antennas is not scored."""
         return bool(self.further.trained_on)
 
     @property
@@ -385,7 +385,7 @@ class AuditResult:
 class EngineResult:
     """The engine that replayed the flight, with its computing time, its omissions and its audit.
 
-    ``not_audited`` is the reason why Sionna RT could not audit the engine. It is empty after an audit.
+    ``not_audited`` is the reason why Sionna RT could not audit the engine. The text is empty after an audit.
     """
 
     engine: str
@@ -402,8 +402,8 @@ class EngineResult:
 class FlightVerdict:
     """The comparison of ray tracing with the best baseline ``against``, over all channels of a flight.
 
-    ``difference_db`` is the RMSE of ray tracing minus that of the baseline, with one offset per channel. It is negative
-    if ray tracing is better. If a receiver lost its lock, its levels without lock count as its floor.
+    ``difference_db`` is the RMSE of ray tracing minus that of the baseline, with one offset per channel. A negative
+    value means that ray tracing is better. If a receiver lost its lock, its levels without lock count as its floor.
     """
 
     against: str
@@ -418,8 +418,8 @@ class FlightVerdict:
 class FlightResult:
     """The results of one flight. A field is empty if the flight does not have such logs.
 
-    ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both are empty
-    if no models were compared.
+    ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both tables are
+    empty if no models were compared.
 
     Parameters
     ----------

@@ -399,7 +399,7 @@ class Channels:
 
 
 def likelihoods(slow: FloatArray, parts: Sequence[CorrelationSet] = ()) -> tuple[FloatArray, FloatArray]:
-    """Return the likelihood (..., m) of each correlation, integrated over the scale, and whitened sums of squares."""
+    """Return the likelihood (..., m) of each correlation at any scale, and the whitened sum of squares."""
     parts = parts or (time_correlations(slow.shape[-1]),)
     square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
     log_det = np.concatenate([part.log_det for part in parts])

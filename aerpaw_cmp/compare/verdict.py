@@ -1,8 +1,8 @@
 """The verdicts on a flight, a campaign, a calibration, a prediction and a map.
 
-A verdict consists of an effect with a 95 % interval, and a cause. It determines the first sentences of a page. Causes
-of the error of a flight are in :mod:`.causes`. A cause is named only if its interval excludes "no effect". If several
-causes are tested, a false one is named in at most :data:`_FALSE_ALARMS` of the cases.
+A verdict consists of an effect with a 95 % interval, and a cause. The verdict determines the first sentences of a page.
+Causes of the error of a flight are in :mod:`.causes`. A cause is named only if its interval excludes "no effect". If
+several causes are tested, a false one is named in at most :data:`_FALSE_ALARMS` of the cases.
 
 The module also compares ray tracing with the best baseline over all channels of a flight. It computes offsets from the
 other flights of a campaign, and finds the nights on which the offset of a node changes suddenly.
@@ -603,7 +603,7 @@ class NodeOffset:
     """The offset of one transmitter or receiver over the nights of a campaign [dB], relative to its median.
 
     ``sd_db`` is the standard deviation between steps, and ``smallest_db`` is the step that is found in the same night
-    with a probability of 90 %. Both are NaN if there are too few nights.
+    with a probability of 90 %. Both numbers are NaN if there are too few nights.
     """
 
     node: str

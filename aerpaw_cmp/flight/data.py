@@ -841,7 +841,7 @@ def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
 
 
 def _home(log: LogSettings, stream: Stream) -> str | None:
-    """Return the tower of a stream in ``cells``, by its PCI or by its name."""
+    """Return the tower that ``cells`` assigns to a stream, by the PCI or the name of the stream."""
     return log.cells.get(int(stream.attributes.get("pci", -1)), log.cells.get(stream.name))
 
 

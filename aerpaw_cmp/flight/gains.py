@@ -52,8 +52,8 @@ class LearnedGain:
     sd_db : (poses,)
         Standard deviation of the sum of learned gains [dB].
     spread : Spread
-        Error model of the level, excluding ``sd_db``. It belongs to the tower's antenna if this is learned, or else to
-        the UAV's antenna.
+        Error model of the level, excluding ``sd_db``. The error model of the tower's antenna is used if this antenna is
+        learned, otherwise that of the UAV's antenna.
     """
 
     pair_db: FloatArray

@@ -248,7 +248,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
     route : _Route
     items : sequence of _Item
     home : tuple of float
-        Latitude, longitude and altitude above sea level of the planned take-off. It may be empty.
+        Latitude, longitude and altitude above sea level of the planned take-off. The tuple may be empty.
     named_yaw : bool
         True if the fourth parameter of a waypoint is its yaw; ArduPilot ignores it.
     """

@@ -433,7 +433,7 @@ class RtSettings(StrictModel):
     Parameters
     ----------
     diffraction : {"none", "edges"}
-        Diffraction over one edge of a building. It is included in H, levels and ranks.
+        Diffraction over one edge of a building. Diffracted paths are included in H, levels and ranks.
     attitude : {"logged", "level", "ignored"}
         ``logged``: the UAV array rotates with the aircraft. ``level``: it rotates with the heading only. ``ignored``:
         it does not rotate.

@@ -76,7 +76,7 @@ _MAXIMUM_SAMPLES = 5_000_000
 
 
 def plan_trajectory(plan: PlanSettings) -> Trajectory:
-    """Return the trajectory of a plan. Its corner times follow from speeds, climb rates and waiting times.
+    """Return the trajectory of a plan. The times of the corners follow from speeds, climb rates and waiting times.
 
     Examples
     --------
@@ -250,7 +250,7 @@ class FlightSimulator:
     Attributes
     ----------
     truth_ : dict
-        Content of truth.json: the true values of all simulated errors. It is complete after :meth:`run`.
+        Content of truth.json: the true values of all simulated errors. The dictionary is complete after :meth:`run`.
     """
 
     def __init__(self, settings: FlightFile, site: Site, folder: Path) -> None:

@@ -183,8 +183,8 @@ class TrackAccount:
         stamp than some row before, or impossible coordinates (including NaN and -999). If that excludes fewer rows, a
         row counts as backward if some row after it has an earlier stamp.
     steps_sorted : int
-        Number of steps back in time in a shuffled file. Its rows are sorted by time, because that makes the path
-        shorter.
+        Number of steps back in time in a shuffled file. The rows of such a file are sorted by time, because that makes
+        the path shorter.
     unknown_attitude : int
         Used rows without attitude (NaN, or exactly 0, 0, 0, which converters write for "unknown").
     heading_alone : int

@@ -270,8 +270,8 @@ class Calibration:
     health : mapping of str to LearnedHealth
         Usual errors of held-out flights, by antenna.
     teaching : set of str
-        Campaigns whose UAV gain is supported by most of their held-out flights. Only the gain of these campaigns may be
-        used elsewhere.
+        Campaigns whose UAV gain is supported by most of their held-out flights. Only these gains may be used for other
+        campaigns.
     """
 
     settings: CalibrationFile

@@ -199,7 +199,7 @@ TileDone = tuple[dict[str, MapResult], int]
 class SiteChannels:
     """The replay of all links of a map in several foliage modes, on common paths.
 
-    The first request for a chunk evaluates all modes. Their results are stored until each mode requests them.
+    The first request for a chunk evaluates all modes. The results of a chunk are stored until each mode requests them.
     """
 
     def __init__(self, site: Site, settings: MapSettings) -> None:
@@ -547,7 +547,7 @@ def check_study(place: Site, settings: MapSettings) -> None:
 
 
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:
-    """Compute correlation, interpolation and its errors on the maps of the paper's foliage mode."""
+    """Compute the correlation, the interpolation and its errors, on maps with the foliage mode of the paper."""
     s, result = outcome.settings, outcome.shown
     rank = interpolation.rank_fields(result)[1]
     local = Sampling(neighbours=s.neighbours, radius_m=s.reach_m, seed=s.seed)

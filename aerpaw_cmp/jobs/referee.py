@@ -102,11 +102,11 @@ class ForeignPrediction:
         - ``sd_db q05_db q95_db rank yaw_deg time_s p_rank1..4``, and the parts ``p_lock locked_db lost_db locked_sd_db
           lost_sd_db`` of a receiver that can lose its lock. NaN if the file does not have them.
     sha256 : str
-        Digest of the file. It is empty for a folder of logs.
+        Digest of the file. Empty for a folder of logs.
     remarks : tuple of str
         Sentences on how the file was read.
     unit : str
-        Unit of ``level_db``. It is empty if the levels have the unit of the log.
+        Unit of ``level_db``. Empty if the levels have the unit of the log.
     near_m : float
         Largest distance between a sample and its predicted position.
     """

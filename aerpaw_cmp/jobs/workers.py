@@ -78,8 +78,8 @@ class Workers(ABC):
         task : callable
         items : sequence
         on_result : callable
-            Receives the number and the result of each item once. It is called in this process, as soon as the result is
-            known.
+            Receives the number and the result of each item once. The call is made in this process, as soon as the
+            result is known.
 
         Raises
         ------
@@ -169,7 +169,7 @@ def _in_trusted_folder() -> Iterator[Path]:
 
 
 def _start_worker(folder: Path) -> None:
-    """Start a worker process in the folder of its parent. It ignores Ctrl-C and ends with the parent."""
+    """Start a worker process in the folder of its parent. The worker ignores Ctrl-C and ends with the parent."""
     os.chdir(folder)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):

@@ -1,8 +1,9 @@
 """The state that the tap's page shows: rows of measurements and predictions, the state of each modem, alarms.
 
-The tap passes records to :meth:`Feed.put`, which appends to a bounded queue. It does not use a lock that a browser
-could hold. A thread of the server processes the queue. Each browser requests the data that are newer than its cursor.
-Rows are stored in rings of fixed size, so memory does not grow with the flight or with browsers that do not read.
+The tap passes records to :meth:`Feed.put`, which appends to a bounded queue. This method does not use a lock that a
+browser could hold. A thread of the server processes the queue. Each browser requests the data that are newer than its
+cursor. Rows are stored in rings of fixed size, so memory does not grow with the flight or with browsers that do not
+read.
 """
 
 from __future__ import annotations

@@ -267,7 +267,10 @@ class TapLog:
         return True
 
     def _put(self, record: Record) -> None:
-        """Write a record as one line. Its number also counts lost records, so that readers notice the loss."""
+        """Write a record as one line.
+
+        The number of the record also counts lost records, so that readers notice the loss.
+        """
         record["n"] = self.records + self.lost
         line = encode_record(record)
         # if a truncated line could not be removed, end it here, so that the checksum refuses only that line

@@ -11,9 +11,9 @@ becomes None with a flag. All other fields and the raw line are kept.
 
 The module converts bytes of an AT port to answers and unsolicited lines, without file, port or clock.
 
-:class:`Framer` is informed of the command in flight. It returns the same events regardless of how the bytes are split.
-Its buffer is bounded: a line is stored up to :data:`_MAX_LINE_BYTES`, and an answer up to ``max_lines``. The rest is
-only counted.
+:class:`Framer` is informed of the command in flight. The parser returns the same events regardless of how the bytes are
+split. The buffer is bounded: a line is stored up to :data:`_MAX_LINE_BYTES`, and an answer up to ``max_lines``. The
+rest is only counted.
 
 A line ends at any run of CR and LF (a modem with echo ends the echo with CR CR LF). Bytes become text as Latin-1,
 so no byte is lost.
@@ -357,7 +357,7 @@ _CSI_WRITE = re.compile(r'AT\+QNWCFG="csi_ctrl",[01],[01]')
 
 
 def csi_write(lte: int, nr5g: int) -> str:
-    """Return the command that switches CSI reporting. It is the only command that changes the modem."""
+    """Return the command that switches CSI reporting. No other command of the tap changes the modem."""
     return f'AT+QNWCFG="csi_ctrl",{int(bool(lte))},{int(bool(nr5g))}'
 
 
@@ -490,7 +490,7 @@ class Unsolicited:
 
 @dataclass(frozen=True, slots=True)
 class Late:
-    """An answer that came after the time-out of its command. It is stored, but not assigned to a query."""
+    """An answer that came after the time-out of its command. A late answer is stored, but not assigned to a query."""
 
     lines: tuple[str, ...]
     status: Status

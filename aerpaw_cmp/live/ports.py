@@ -1,7 +1,7 @@
 """Serial ports of the tap: find the modem's AT port, open it exclusively, and report other processes that use it.
 
 The port is opened with ``termios`` directly. pyserial is not used, because it empties the input queue when it opens a
-port, so that waiting answers are lost. It also requires a DTR ioctl that some USB paths refuse, and reports an
+port, so that waiting answers are lost. pyserial also requires a DTR ioctl that some USB paths refuse, and reports an
 unplugged cable by three unrelated exceptions (its issues 401 and 417). Here an unplugged cable always raises
 :class:`PortGoneError`.
 
@@ -190,7 +190,7 @@ def _open_files(process: Path) -> Iterator[os.stat_result]:
 
 
 def modem_manager() -> Holder | None:
-    """Return ModemManager if it runs. Its name is visible even if its open files are not."""
+    """Return ModemManager if it runs. The name of that process is visible even if its open files are not."""
     return next((holder for _, holder in _processes() if holder.name == "ModemManager"), None)
 
 
@@ -321,7 +321,7 @@ class SerialPort:
                 raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
 
     def close(self) -> None:
-        """Close the port. It is safe to call if the port is gone."""
+        """Close the port. This method can be called even if the port is gone."""
         if self._fd >= 0:
             with contextlib.suppress(OSError, termios.error):
                 fcntl.ioctl(self._fd, termios.TIOCNXCL)
@@ -464,7 +464,7 @@ class StatusNotifier:
         self._thread.start()
 
     def notify(self, status: TapStatus) -> None:
-        """Queue a status. It is dropped if the queue is full, or if it has no message and ten statuses wait."""
+        """Queue a status. The status is dropped if the queue is full, or if ten statuses wait and it has no message."""
         # lines without a message may be dropped, because the next line overwrites them. A message is shown only once.
         if status.message or self._queue.qsize() < 10:
             try:
@@ -525,7 +525,7 @@ class TapSummary:
 
 
 def format_status(status: TapStatus) -> str:
-    """Return one line for the terminal. It contains no text from the modem."""
+    """Return one line for the terminal. The line contains no text from the modem."""
     if not status.connected:
         head = "NO PORT"
     elif status.rank is None:
@@ -610,7 +610,7 @@ class Schedule:
 
 
 class Stop:
-    """A request to end, from a signal or another thread. It wakes the waiting tap.
+    """A request to end, from a signal or another thread. The request wakes the waiting tap.
 
     Inside a ``with`` block, SIGINT, SIGTERM and SIGHUP request the end. The end of the block closes the pipe. Only
     the main thread receives signals, and an ignored signal (nohup) stays ignored.

@@ -78,8 +78,8 @@ class RunningInterval:
     -----
     The bounds are order statistics of the last ``keep`` residuals. Neighbours in time are correlated, so quantiles
     alone would cover less than ``share``. Therefore, after each residual, the tail share ``a`` is changed by
-    ``a += step (1 - share - outside)`` (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170). This makes the long-run
-    share correct for any sequence.
+    ``a += step (1 - share - outside)`` (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170). This update makes the
+    long-run share correct for any sequence.
 
     Examples
     --------
@@ -243,7 +243,7 @@ _DELAYS = 20
 class TelemetryFollower:
     """A reader of the last lines of a telemetry log that is still being written.
 
-    It supports formats with independent lines (``vehicleOut``).
+    Only formats with independent lines (``vehicleOut``) are supported.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ _LATENCY_S = 0.02
 
 
 def flight_rank(seconds: float) -> int:
-    """Return the rank of the built-in flight. It varies slowly between 1 and 4, and is sometimes 0 (no CSI)."""
+    """Return the rank of the built-in flight. The rank varies slowly between 1 and 4, and is sometimes 0 (no CSI)."""
     if seconds % 120.0 > 118.0:
         return 0
     return 1 + round(1.5 + 1.5 * math.sin(seconds / 20.0))

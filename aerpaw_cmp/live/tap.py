@@ -83,7 +83,8 @@ class Tap:
     watch : callable, optional
         Receives each logged record and each status. It must neither wait nor raise.
     predict : callable, optional
-        ``predict(utc_ns)`` returns the Prediction for the pose at that time, or None. It runs in a separate thread.
+        ``predict(utc_ns)`` returns the Prediction for the pose at that time, or None. The function runs in a separate
+        thread.
     clock : Clock, optional
     """
 

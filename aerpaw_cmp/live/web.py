@@ -1,9 +1,9 @@
 """The tap's page for browsers: one page and one stream of events, with the standard library.
 
-The server only answers GET requests for ``/`` and ``/events``, and reads no file. It refuses requests from other sites
-(Host, Origin, Sec-Fetch-Site), so that a page on the Internet cannot read the data by DNS rebinding. Every request
-needs the token of the printed address, because all users of a machine share the loopback. The first visit with the
-token sets a cookie, which then replaces the token.
+The server only answers GET requests for ``/`` and ``/events``, and reads no file. The server refuses requests from
+other sites (Host, Origin, Sec-Fetch-Site), so that a page on the Internet cannot read the data by DNS rebinding. Every
+request needs the token of the printed address, because all users of a machine share the loopback. The first visit with
+the token sets a cookie, which then replaces the token.
 
 Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`. A browser that does not read for some
 seconds is disconnected. When it comes back, it gets the data that it missed. The tap never waits for a browser.
@@ -431,7 +431,10 @@ def _is_loopback(host: str) -> bool:
 
 
 def _own_host(text: str, loopback: bool) -> bool:
-    """Check whether a Host header names this computer by address or host name. Its port may be that of a tunnel."""
+    """Check whether a Host header names this computer by address or host name.
+
+    The port in the header may be that of a tunnel.
+    """
     match = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(:[0-9]{1,5})?", text)
     if match is None:
         return False

@@ -352,5 +352,5 @@ class Column:
         self._content += piece.astype(self._dtype, copy=False).tobytes()
 
     def array(self) -> AnyArray:
-        """Return the column as an array. It cannot grow after that."""
+        """Return the column as an array. The column cannot grow after that."""
         return np.frombuffer(self._content, dtype=self._dtype)

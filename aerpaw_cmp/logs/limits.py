@@ -4,16 +4,16 @@ A value outside its range becomes NaN. For a position, an attitude or a velocity
 row gets a flag, and a warning states the number of these rows and the first row. Rows with a flag of
 :data:`UNSCORED` stay in the records and are not compared.
 
-The ranges follow from physics and from the performance of small aircraft. They are wide, because they should find
+The ranges follow from physics and from the performance of small aircraft. The ranges are wide, because they should find
 impossible values (a corrupted digit, an overflow, a sentinel) and not unusual values.
 
 Speeds reveal wrong clocks and positions: no small aircraft flies faster than 100 m/s, or gains 10 m/s in a second.
 
-If a few positions cannot be reached in time from the rows around them, the receiver jumped. They are flagged and read
-as missing. A distant position at which a log begins or ends at rest, such as the origin of an autopilot's filter, is
-treated in the same way. Positions that do not change although a speed is logged are stale. They are also flagged and
-read as missing. If a track is too fast throughout, its times are in another unit. If a track is at two positions at the
-same time, it belongs to two vehicles. Both cases are reported, and the values are not changed.
+If a few positions cannot be reached in time from the rows around them, the receiver jumped. These positions are flagged
+and read as missing. A distant position at which a log begins or ends at rest, such as the origin of an autopilot's
+filter, is treated in the same way. Positions that do not change although a speed is logged are stale. Stale positions
+are also flagged and read as missing. If a track is too fast throughout, its times are in another unit. If a track is at
+two positions at the same time, it belongs to two vehicles. Both cases are reported, and the values are not changed.
 """
 
 from __future__ import annotations

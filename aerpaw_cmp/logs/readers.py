@@ -1,6 +1,6 @@
 """The interface of readers, and the search for the reader of a file.
 
-A reader is a pure function of bytes. It opens no file or port. Each format module builds one :class:`Reader` and
+A reader is a pure function of bytes, and opens no file or port. Each format module builds one :class:`Reader` and
 lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` names.
 
 The clock, the height datum and the identity of each stream are either written in the file, known from its program, or
@@ -54,7 +54,7 @@ class ReadOptions:
     columns : mapping, optional
         Name of the file column for each record column, only for generic CSV.
     read_elsewhere : collection of str
-        Columns of the same file that the user reads with other options. They do not need a warning.
+        Columns of the same file that the user reads with other options. These columns do not need a warning.
     kind : str, optional
         Kind of stream, only for generic CSV.
     node, channel : str, optional
@@ -126,7 +126,8 @@ class Reader:
     sample : str
         One typical line.
     sniff : callable
-        ``sniff(head: bytes) -> bool``. It tests only the content, never the file name, and must not raise an exception.
+        ``sniff(head: bytes) -> bool``. The function tests only the content, never the file name, and must not raise an
+        exception.
     read : callable
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
     pieces : bool

@@ -112,7 +112,7 @@ class Rows:
         _text.add_flag(self.flag, where, reason)
 
     def part(self, where: BoolArray) -> Rows:
-        """Return the rows of a mask. They share the warnings and the account of all rows."""
+        """Return the rows of a mask. The result shares the warnings and the account of all rows."""
         columns = {name: cells[where] for name, cells in self.columns.items()}
         return replace(
             self, row=self.row[where], time=self.time[where], flag=self.flag[where], at=self.at[where], columns=columns
@@ -203,8 +203,8 @@ def matched(
     ----------
     data : bytes
     pattern : re.Pattern
-        Compiled with MULTILINE, from ``^`` to ``\r?$``. It must not match across a line end, and every repetition must
-        be bounded. One of its named groups is ``time``.
+        Compiled with MULTILINE, from ``^`` to ``\r?$``. The pattern must not match across a line end, and every
+        repetition must be bounded. One of its named groups is ``time``.
     reason : callable
         Function that returns why a line that does not match is rejected, or None for a header, comment or console
         output.

@@ -450,7 +450,7 @@ def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> Instants:
-    """Convert times without a zone to UTC. They are local unless ``clock: utc`` is set in the options."""
+    """Convert times without a zone to UTC. The times are local unless ``clock: utc`` is set in the options."""
     if options.clock == "utc":
         none = np.zeros(len(wall_ns), dtype=bool)
         return Instants(wall_ns.astype("datetime64[ns]"), none, none)

@@ -1,4 +1,6 @@
-"""Conversion of records to the bytes of real AERPAW log formats for ``simulate``. It is the inverse of the readers.
+"""Conversion of records to the bytes of real AERPAW log formats for ``simulate``.
+
+The writers are the inverse of the readers.
 
 All functions are pure functions of arrays and do not open files. Layouts are exactly those of the tools that write the
 real logs: CR LF line ends from Python's ``csv``, octal offsets and ``*`` runs from ``od``.

@@ -12,8 +12,8 @@ is no sample, the value is NaN.
 
 Three further baselines are the nearest sample, inverse distance, and the mean over the area that a tower serves. All
 classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
-:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`. They do not estimate their error, so the variance that they return is
-NaN.
+:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`. These interpolators do not estimate their error, so the variance that
+they return is NaN.
 
 Interpolators are scored by leave-one-out, as in the paper, and by blocks, so that close neighbours are held out, too.
 Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the

@@ -12,8 +12,8 @@ Each function replaces an existing file and returns its path.
 
 :func:`maps_dataset` returns arrays over foliage, tower, K, height, y and x, rounded to 0.01 dB, which is finer than the
 accuracy of the site's data. Maps in which the nearest tower serves each position are separate variables
-(``..._joint``). They contain the values that ``serving_tower`` selects from the maps of each tower. NetCDF requires
-``pip install aerpaw-cmp[geo]``.
+(``..._joint``). The joint variables contain the values that ``serving_tower`` selects from the maps of each tower.
+NetCDF requires ``pip install aerpaw-cmp[geo]``.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class MapLayers:
         Lines between the areas that two towers serve.
     credit : str
         Attribution of the map from which the site was made. The licence of the map requires it in derived works. Empty
-        if there is no attribution. It is not written to the CSV.
+        if there is no attribution. The CSV does not contain the attribution.
     """
 
     grid: Grid

@@ -508,7 +508,7 @@ class LinkBudget:
     tx_power_dbm : float
         Transmit power of a tower. The paper's 10 W are 40 dBm.
     bandwidth_mhz : float, optional
-        Receiver bandwidth B. It is required for an SNR.
+        Receiver bandwidth B. Required for an SNR.
     noise_figure_db : float
         Noise figure F of the receiver.
     threshold_dbm, threshold_snr_db : float, optional

@@ -263,7 +263,7 @@ class Weights:
     index : (targets, M) int
         Numbers of the positions that are used; -1 after the last position.
     weight : (targets, M)
-        Weights; 0 after the last sample. They sum to 1 for a target with samples.
+        Weights; 0 after the last sample. The weights of a target with samples sum to 1.
     variance : (targets,)
         Kriging variance for ``v^2 = 1``; NaN if there is no sample.
     regularised : (targets,) bool
@@ -291,7 +291,7 @@ class OrdinaryKriging:
     neighbours : int
         M, the largest number of samples per target.
     radius_m : float
-        r0, the search radius [m]. It may be infinite.
+        r0, the search radius [m]. Infinity is allowed.
     selection : {"nearest", "random"}
         The M nearest samples (ties by the rule of :mod:`~aerpaw_cmp.maps.kriging`), or M random samples within the
         radius.

@@ -1,8 +1,8 @@
 """Tiles of a map: towers and buildings that can reach a tile, a file per finished tile, and a Zarr store of all.
 
 A killed run loses only the tiles that were being computed. The same command then computes these and all remaining
-tiles. A tile file contains its SHA-256, the number of paths, and the planes of :data:`PLANES` as 32-bit floats. It
-cannot contain executable code. A tile whose file has a different length or digest is computed again.
+tiles. A tile file contains its SHA-256, the number of paths, and the planes of :data:`PLANES` as 32-bit floats. A tile
+file cannot contain executable code. A tile whose file has a different length or digest is computed again.
 
 A tile is evaluated with the towers and buildings that can reach it. With at most one reflection over level ground, a
 path seen from above is the line between its ends, or two lines from a tower to a wall and on to the tile. Therefore, no

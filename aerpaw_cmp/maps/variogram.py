@@ -3,13 +3,13 @@
 Two correlations are averaged over pairs of positions in bins of distance:
 
 - :func:`vector_correlation` is the correlation of the paper (arXiv 2502.10324, section VI-A): the Pearson correlation
-  of the vectors of two positions, which contain the ranks of all altitudes and K. It mixes horizontal and vertical
-  changes.
+  of the vectors of two positions, which contain the ranks of all altitudes and K. This correlation mixes horizontal and
+  vertical changes.
 - :func:`field_correlation` is horizontal: each field (one altitude, one K) is standardised over the positions, and the
   values of two positions are multiplied.
 
-Both can be used for RSS and rank. NaN means out of coverage. The caller decides whether a rank of 0 is used as a number
-or is NaN.
+Both correlations can be used for RSS and rank. NaN means out of coverage. The caller decides whether a rank of 0 is
+used as a number or is NaN.
 
 Bins follow the paper. Bin ``n`` contains the pairs whose distance is nearest to ``n`` times the width; half-way values
 are rounded up. Bin 0 contains each position with itself, where the correlation is 1 by definition.

@@ -213,7 +213,7 @@ def replay_moving(
     ----------
     site : Site
     link : Link
-        Link with one tower. Its array keeps its orientation in the site.
+        Link with one tower. The array of the tower keeps its orientation in the site.
     poses : Poses
     sources_m : (poses, 3)
         Centre of the tower's array at each pose, east, north, up [m].
@@ -384,9 +384,9 @@ def singular_values_of(
 
     Notes
     -----
-    The UAV receives. Both rays are added as powers. The singular values are the roots of the eigenvalues of
-    ``L L^H + g^2 G G^H``. This is the mean of ``H H^H`` over a band in which the phase between ground ray and direct
-    ray takes all values.
+    The UAV receives. Direct ray and ground ray are added as powers. The singular values are the roots of the
+    eigenvalues of ``L L^H + g^2 G G^H``. This sum is the mean of ``H H^H`` over a band in which the phase between
+    ground ray and direct ray takes all values.
     """
     for mount, several in groupby(geometries, lambda g: g.mount_deg):
         run = list(several)
@@ -408,7 +408,7 @@ def basis_fields(
     Parameters
     ----------
     tower, uav : Array
-        Arrays of both ends. Their slants are not used.
+        Arrays of both ends. The slants of these arrays are not used.
     tower_m : (3,)
         Centre of the tower's array [m].
     poses : Poses

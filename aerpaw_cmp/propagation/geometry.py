@@ -440,7 +440,7 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> Faces:
 
 
 def _roof(building: Building, footprint: Polygon, solid: int) -> Faces:
-    """Return the roof. Its axes follow the longest edge, so that a rectangular roof fills its bounds."""
+    """Return the roof. The axes follow the longest edge, so that a rectangular roof fills its bounds."""
     points = np.asarray(footprint.exterior.coords, dtype=np.float64)
     edges = np.diff(points, axis=0)
     longest = edges[np.argmax(np.hypot(edges[:, 0], edges[:, 1]))]

@@ -261,13 +261,15 @@ def _run_trial(library: Library | None, variant: str, program: str, timeout_s: f
 
 
 def try_library(library: Library, *, program: str = _SIONNA_LOADS, timeout_s: float = _TRIAL_TIMEOUT_S) -> Trial:
-    """Trace two paths with this library in a child process (about 2 s with Sionna). It never raises or crashes itself.
+    """Trace two paths with this library in a child process (about 2 s with Sionna).
+
+    An error or a crash of the child becomes a failed trial.
 
     Parameters
     ----------
     library : Library
     program : str
-        Program that the child runs. It prints one JSON line.
+        Program that the child runs. The program prints one JSON line.
     timeout_s : float
         Time after which the child is ended and the trial counts as failed [s].
 
@@ -341,7 +343,7 @@ def _cached_trial(library: Library) -> Trial:
 
 @cache
 def _trials() -> tuple[Trial, ...]:
-    """Return the trials that led to the choice of this process. They are made once."""
+    """Return the trials that led to the choice of this process. The trials are made once per process."""
     return tuple(first_that_works(candidates(), _cached_trial))
 
 
@@ -351,7 +353,7 @@ def prepare_llvm() -> Path:
     Returns
     -------
     Path
-        The library. Its path is now also in ``os.environ["DRJIT_LIBLLVM_PATH"]``.
+        The library. The path is now also in ``os.environ["DRJIT_LIBLLVM_PATH"]``.
 
     Raises
     ------

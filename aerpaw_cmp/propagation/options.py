@@ -38,7 +38,7 @@ class Search:
         ``sionna`` only: poses per call.
     further : tuple of callable
         Searches ``(scene, poses, link)`` of further kinds of paths, such as
-        :func:`aerpaw_cmp.propagation.edges.over_edges`. They are part of H, levels and ranks for both engines.
+        :func:`aerpaw_cmp.propagation.edges.over_edges`. Further paths are part of H, levels and ranks for both engines.
     links : (towers, poses) bool, optional
         Links to search. Other links have no path.
     """
@@ -88,7 +88,7 @@ Progress = Callable[[float], object]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """Options of running a replay. They do not change any result.
+    """Options of running a replay. No option changes a result.
 
     Parameters
     ----------
@@ -97,8 +97,8 @@ class Run:
         else ``~/.cache/aerpaw-cmp``. The ``image`` engine is faster than a cache, and uses it only if this folder is
         given.
     extent_m : (points, 3), optional
-        Points that span all poses of a job, if the poses are only a part of the job. They determine the tolerance of
-        the path search, so that a part has the same paths as in a replay of all poses.
+        Points that span all poses of a job, if the poses are only a part of the job. The span determines the tolerance
+        of the path search, so that a part has the same paths as in a replay of all poses.
     progress : callable, optional
         Called with the completed share.
     """

@@ -30,7 +30,7 @@ class Scene:
     excluded : (towers, poses) bool
         Links without a path: an end inside a building or under the ground.
     surfaces : Surfaces or None
-        Materials and triangles of the faces, for a site with a scene of triangles. They replace ground planes.
+        Materials and triangles of the faces, for a site with a scene of triangles. The triangles replace ground planes.
     """
 
     faces: Faces

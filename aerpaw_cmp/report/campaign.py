@@ -756,7 +756,7 @@ def campaign_page(data: CampaignData, files: Sequence[str]) -> str:
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     """Write ``campaign.html``, ``campaign.json`` and the tables. Return their paths, beginning with the page.
 
-    ``pairs.csv`` lists the pairs of flights at the same positions. They are not in campaign.json.
+    ``pairs.csv`` lists the pairs of flights at the same positions. The pairs are not in campaign.json.
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None

@@ -216,9 +216,9 @@ def draw_marks(ax: Axes, marks: Sequence[Mapping[str, Any]]) -> None:
     ----------
     ax : Axes
     marks : sequence of mapping
-        Marks of :func:`mark`. Their look may have ``colour``, ``dash`` (line style), ``alpha``, ``marker``, ``size``
-        and ``hatch``. A mark of kind ``spans`` fills the background between ``x`` and ``ends``, up to the share
-        ``height`` of the axes. The script of a page does not draw this kind.
+        Marks of :func:`mark`. The look of a mark may have ``colour``, ``dash`` (line style), ``alpha``, ``marker``,
+        ``size`` and ``hatch``. A mark of kind ``spans`` fills the background between ``x`` and ``ends``, up to the
+        share ``height`` of the axes. The script of a page does not draw this kind.
     """
     for number, item in enumerate(marks):
         kind, x = item["kind"], item["x"]

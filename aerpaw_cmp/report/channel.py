@@ -383,7 +383,7 @@ def chosen_formats(names: Iterable[str]) -> tuple[str, ...]:
     Raises
     ------
     UsageError
-        If a name is unknown, or netCDF4 is missing. This is reported before a replay, which may take hours.
+        If a name is unknown, or netCDF4 is missing. Both errors are reported before a replay, which may take hours.
 
     Examples
     --------

@@ -298,7 +298,10 @@ def models_verdict(models: Sequence[ModelRow]) -> str:
 
 
 def training_sentence(names: Sequence[str], what: str) -> str:
-    """Return the summary of a report on a training log. Its errors are smaller than errors of a prediction."""
+    """Return the summary of a report on a training log.
+
+    The errors on a training log are smaller than the errors of a prediction.
+    """
     of = _listed(list(names)) if len(names) < 3 else f"{len(names)} channels"
     were = "was" if what == "the receiver" else "were"
     return (

@@ -719,7 +719,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
 
 
 def result_card(data: MapsData) -> Card:
-    """Return the card of the shares in coverage, and of the numbers of the paper."""
+    """Return the card with the shares of positions in coverage, and the corresponding numbers of the paper."""
     paper = Table(
         caption="What the paper (arXiv 2502.10324) states, and the results of this run.",
         columns={"Where": HEAD, "What": TEXT, "Paper": TEXT, "Here": TEXT, "Figure": TEXT},

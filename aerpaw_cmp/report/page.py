@@ -1,4 +1,4 @@
-"""Basis of all pages: template engine, files of a folder of results, and figures.
+"""Common parts of all pages: template engine, figures, and the writing of files to a results folder.
 
 A page is a single file that needs no network. The template engine escapes every text from a log or a
 configuration.
@@ -92,7 +92,7 @@ def digest(text: str) -> str:
 
 @cache
 def environment() -> Any:
-    """Return the template engine. It escapes all text and fails on undefined names."""
+    """Return the template engine. The engine escapes all text and fails on undefined names."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

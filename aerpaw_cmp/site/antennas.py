@@ -265,10 +265,10 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
 
     Notes
     -----
-    The direction of phi follows from the poles, where the two components must describe the same vector for all phi.
-    This shows whether E_phi points along increasing phi. If it points the other way, as in AERPAW's files, phi is the
-    angle of a turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement in this way). If the poles
-    radiate too little to decide, the direction of AERPAW's files is used.
+    The direction of phi follows from the poles, where the two components must describe the same vector for all phi. The
+    poles therefore show whether E_phi points along increasing phi. If it points the other way, as in AERPAW's files,
+    phi is the angle of a turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement in this way). If the
+    poles radiate too little to decide, the direction of AERPAW's files is used.
     """
     path = Path(path)
     rows = _read_rows(path)

@@ -674,11 +674,11 @@ def import_site(
         Packaged site or site.yaml that provides towers and settings. Without ``towers``, the default is Lake Wheeler if
         the map is of that area.
     towers : sequence of str
-        ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace the towers of
+        ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. These towers replace the towers of
         ``base``. Without a base, the first tower is the origin. If the map has three or more elevations (tag ``ele``),
         the ground is then a smooth surface through them. Otherwise it is flat.
     dem : str or path, optional
-        Elevation model of the ground, heights above sea level. It replaces the elevation model of ``base``.
+        Elevation model of the ground, heights above sea level. This model replaces the elevation model of ``base``.
     dem_crs : str, optional
         Coordinate system of ``dem``, for ASCII grids.
     **options

@@ -1,8 +1,8 @@
 """Calibrations of a site from flights, in the folder of its file: ``NAME.learned/learned.yaml`` and its tables.
 
-Each entry is a campaign: learned antennas by tower and channel, their airframe, or a rank receiver. It contains the
-band, the training logs (SHA-256), errors on held-out flights, the source of the flights and the command that learns the
-entry again. Every table and every entry is verified by its SHA-256 when it is read.
+Each entry is a campaign: learned antennas by tower and channel, their airframe, or a rank receiver. An entry contains
+the band, the training logs (SHA-256), errors on held-out flights, the source of the flights and the command that learns
+the entry again. Every table and every entry is verified by its SHA-256 when it is read.
 
 There are three kinds of tables: the gain over the full sphere with its standard deviation (also as cuts for planning
 tools), the gain towards both ends at once, and the directions in which a gain is known, with its covariance.
@@ -112,11 +112,11 @@ class LearnedLock(StrictModel):
     """The lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) [path gain in dB].
 
     Levels in lock have the mean ``locked_db`` at a path gain of ``gain_db``, and the SD ``locked_sd_db`` within a
-    flight. They increase by ``locked_per_db`` for each dB of path gain. This factor is less than 1, because a weak
-    signal is in lock only if it is stronger than expected. The values that begin with ``lost`` describe levels without
-    lock [unit of the measurement]. Three scores are means over held-out flights: the Brier score and the log score
-    [nat], each for the model and for a constant share, and the RMSE of all samples if the floor replaces lower levels
-    [dB].
+    flight. Levels in lock increase by ``locked_per_db`` for each dB of path gain. This factor is less than 1, because a
+    weak signal is in lock only if it is stronger than expected. The values that begin with ``lost`` describe levels
+    without lock [unit of the measurement]. Three scores are means over held-out flights: the Brier score and the log
+    score [nat], each for the model and for a constant share, and the RMSE of all samples if the floor replaces lower
+    levels [dB].
     """
 
     gain_db: float
@@ -243,8 +243,8 @@ class LearnedSeries(StrictModel):
     sd_db : float
         Mean standard deviation of the level over flown directions.
     shares_airframe : bool
-        False if the gain of the UAV does not predict held-out flights of its campaign. It is then used only for this
-        campaign.
+        False if the gain of the UAV does not predict held-out flights of its campaign. The gain is then used only for
+        this campaign.
     level : LearnedLevel, optional
         Level above free space. For receivers that can lose their lock, only levels in lock are used.
     """
@@ -698,7 +698,7 @@ _WANTED = {"uav": "the UAV", "tower": "a tower", "receiver": "the rank receiver"
 
 
 def _parts(name: str, entry: Entry, end: str) -> dict[str, str]:
-    """Return the full names of the parts of an entry that fit an end, by part."""
+    """Return the full names of the antennas and receivers of an entry that can be used at an end, by short name."""
     parts = {"": name} if end in ("", "receiver") and (not end or entry.receivers) else {}
     if end in ("", "uav") and entry.series:
         parts["uav"] = f"{name}_uav"

@@ -81,7 +81,7 @@ class Material:
         return float(c * (frequency_hz / 1e9) ** d)
 
     def relative_permittivity(self, frequency_hz: float) -> complex:
-        """Return the complex relative permittivity at a frequency. Its imaginary part is negative (loss).
+        """Return the complex relative permittivity at a frequency. The imaginary part is negative (loss).
 
         Source: arXiv 2502.10324 eq. 5; ITU-R P.2040 table 3.
 

@@ -379,7 +379,7 @@ def _of_shape(shape: ElementTree.Element, name: str, radio: Mapping[str, str], u
 
 
 def _file_of(shape: ElementTree.Element, name: str, path: Path) -> Path:
-    """Return the mesh file of a shape. It must be in the folder of the scene."""
+    """Return the mesh file of a shape. The file must be in the folder of the scene."""
     # exporters write empty transforms, which have no effect
     if len(shape.find("transform[@name='to_world']") or ()):
         raise InputError(

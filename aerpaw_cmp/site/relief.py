@@ -8,7 +8,7 @@ Reflections from this ground are in :mod:`aerpaw_cmp.propagation.search.terrain`
 The smooth surface is a Gaussian process through points of known height, with a standard deviation and random draws.
 
 The covariance of two positions is a Matern function of order 3/2 of their distance (slopes are continuous, curvature
-is not). Its variance and length maximise the likelihood of the points.
+is not). The variance and the length of the covariance maximise the likelihood of the points.
 """
 
 from __future__ import annotations
@@ -478,9 +478,9 @@ class Surface:
         return Factor.of(self._between(self.place_m) + np.diag(self.error_m**2))
 
     def _waves(self, random: np.random.Generator) -> _Waves:
-        """Return a random surface with the covariance of the process. It does not pass through the points.
+        """Return a random surface with the covariance of the process. The surface does not pass through the points.
 
-        It is a sum of waves, whose wave vectors are drawn from the spectrum of the process.
+        The surface is a sum of waves, whose wave vectors are drawn from the spectrum of the process.
         """
         # the spectrum of order 3/2 is Student's t with 3 degrees of freedom: a normal divided by sqrt(chi-squared / 3)
         vector = random.standard_normal((2, _WAVES)) / (self.length_m * np.sqrt(random.chisquare(3, _WAVES) / 3.0))

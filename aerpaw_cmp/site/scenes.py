@@ -237,8 +237,8 @@ def usable_scene(
     TriangleScene
         Scene without vegetation, and without meshes around or below an antenna.
     tuple of Forest
-        One medium per connected part of a vegetation mesh, without trunks. It has the outline of the part from above,
-        extends from the lowest to the highest corner, and is filled according to the volume.
+        One medium per connected part of a vegetation mesh, without trunks. A medium has the outline of the part from
+        above, extends from the lowest to the highest corner, and is filled according to the volume.
     list of str
         List of actions.
     """

@@ -166,7 +166,7 @@ class Site:
     area_m : (east_min, east_max, north_min, north_max)
         Extent for maps.
     credit : str
-        Source of the map. It is shown wherever buildings and forests are drawn.
+        Source of the map. The credit is shown wherever buildings and forests are drawn.
     assumed : str
         Sentence about sizes that the map does not state and that are assumed.
     notes : tuple of str
@@ -215,8 +215,8 @@ class Site:
     def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Return the height of the ground, shape (n,) [m].
 
-        This is the height of the terrain if it is known. Otherwise it is the ground height of the nearest tower or, in
-        a scene of triangles, of the take-off point.
+        If the terrain is known, the height of the terrain is used. Otherwise it is the ground height of the nearest
+        tower or, in a scene of triangles, of the take-off point.
 
         A ground height of a tower above 0 is taken as 0, because the ground between towers is lower and a UAV may be
         there.

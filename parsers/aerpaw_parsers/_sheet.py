@@ -1,8 +1,9 @@
 """Tables with a header and columns in any order. The dictionary contains the meaning of column names.
 
-The header may follow title lines. Its separator is also the separator of the rows. Decimal commas are read if the
-separator is another character. A header in the middle of the file begins a new table. Trailing cells that a program
-omits are read as empty. A table whose values are outside the ranges of the dictionary for its header is refused.
+The header may follow title lines. The separator of the header is also the separator of the rows. Decimal commas are
+read if the separator is another character. A header in the middle of the file begins a new table. Trailing cells that a
+program omits are read as empty. A table whose values are outside the ranges of the dictionary for its header is
+refused.
 """
 
 from __future__ import annotations
@@ -301,7 +302,10 @@ class Sheet:
         return found
 
     def unit_read(self, column: int) -> str:
-        """Return the unit of :meth:`numbers`. It is empty if brackets contain other text, such as ``(LTE scell0)``."""
+        """Return the unit of :meth:`numbers`.
+
+        The unit is empty if brackets contain other text, such as ``(LTE scell0)``.
+        """
         self.numbers(column)
         return dictionary.unit_of(self._cell_units.get(column) or self.unit(column))
 

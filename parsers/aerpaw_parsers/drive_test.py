@@ -410,7 +410,7 @@ def of_radio(rows: Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
 def _keys(sheet: _sheet.Sheet, column: int) -> list[str]:
     """Return the quantities by which the levels of a column are divided into series.
 
-    They include the radio access only if there are several.
+    Names include the radio access only if there are several.
     """
     technology = sheet.find("technology")
     texts = () if technology is None else compress(sheet.texts(technology), np.isfinite(sheet.numbers(column)))

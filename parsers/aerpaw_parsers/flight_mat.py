@@ -1,8 +1,9 @@
 """Merged MATLAB flights: telemetry and level of each channel in one table, as their authors publish them.
 
-Dataset 12 has ``mpower1 mpower2`` (channels USRP1, USRP2), and AFAR's exp-288 files ``mpower mquality``. Both have ``mX
-mY mZ`` (longitude, latitude, height above take-off) and ``mRoll mPitch mYaw`` in degrees. Their two clocks are
-``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, which is **local time stored as if it were UTC**.
+Dataset 12 has ``mpower1 mpower2`` (channels USRP1, USRP2), and AFAR's exp-288 files ``mpower mquality``. Both kinds of
+files have ``mX mY mZ`` (longitude, latitude, height above take-off) and ``mRoll mPitch mYaw`` in degrees. Their two
+clocks are ``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, which is **local time stored as if it were
+UTC**.
 
 The LTE flights have ``RSRP RSRP2 RSRQ RSSI`` and ``mX mY mZ``, with ``timestamp_for_csv`` (text, local) and
 ``timestamp_meas``, which **is UTC** and is used. No cell was decoded where ``succes`` is 0: ``RSRP2`` is then -60, and

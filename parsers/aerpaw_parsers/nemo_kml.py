@@ -1,7 +1,8 @@
 """Measurements of a Keysight Nemo phone, as KML: one placemark description per report, one quantity per file.
 
-Only the description lines are read. Each contains one report. They are read by patterns and not as XML, because a
-parser that resolves entities is a risk with an untrusted file. All other lines are markup and count as comments.
+Only the description lines are read. Each contains one report. The descriptions are read by patterns and not as XML,
+because a parser that resolves entities is a risk with an untrusted file. All other lines are markup and count as
+comments.
 """
 
 from __future__ import annotations

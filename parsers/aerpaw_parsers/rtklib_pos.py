@@ -1,6 +1,6 @@
 """Position solutions of RTKLIB (``.pos``): latitude, longitude and height.
 
-A comment line (``%``) names the columns. Its first name is the time scale: GPST, UTC or JST. Times are a date with a
+A comment line (``%``) names the columns. The first name is the time scale: GPST, UTC or JST. Times are a date with a
 clock, or a GPS week with its second. The fix has MAVLink's numbers: 3 single, 4 differential, 5 and 6 RTK, 8 PPP.
 """
 

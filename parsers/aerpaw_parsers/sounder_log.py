@@ -3,7 +3,7 @@
 ``[2025-01-01 12:00:00.000000] 0000014      -35.401386``: arrival time, **octal** byte offset of the sample (four bytes
 each), value in dB re full scale. ``*`` replaces samples that are equal to the sample before them. The last line may
 contain only an offset. Without a signal, the power is 20 log10(FLT_MIN) minus the gain, about -790 dB. Writer: AERPAW
-``startGNURadio-ChannelSounder-RX.sh``. Its nightly soundings between towers name the link in the file's name:
+``startGNURadio-ChannelSounder-RX.sh``. Files of nightly soundings between towers name the link in the file name:
 ``LW1:LW2:3235751:3.32G:0:2026-06-01_02_00_05:power_log.txt`` (transmitter or ``null``, receiver, radio, channel).
 """
 

@@ -154,7 +154,7 @@ class DraftOptions:
     mapping : mapping
         ``columns``, ``kind``, ``unit`` and ``ri_base`` of generic CSV files.
     site : str
-        Packaged site, or path of a site.yaml relative to the folder. Its learned antennas are used.
+        Packaged site, or path of a site.yaml relative to the folder. The learned antennas of this site are used.
     """
 
     timezone: str | None = None
@@ -611,7 +611,7 @@ class _Context:
         return any(stream is self.track for stream in file.result.streams)
 
     def shift(self, stream: Stream) -> np.timedelta64:
-        """Return the time to add to a UTC clock that was read as local time. It is 0 for other clocks."""
+        """Return the time to add to a UTC clock that was read as local time. The result is 0 for other clocks."""
         span = stream_span(stream)
         # a clock is not corrected if the log itself specifies its UTC offset
         if self.flown is None or span is None or stream.kind == "telemetry":

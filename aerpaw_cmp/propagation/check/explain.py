@@ -1,8 +1,9 @@
 """The composition of the paths of one link, term by term, and reasons why other paths do not exist.
 
-The level of a path is the mean of its power over element pairs. Each term is the ratio [dB] of that mean after and
-before a step (tower's antenna, reflections, spreading, UAV's antenna, polarisation). The terms therefore add up to the
-level for any arrays. With a single element at each end, the terms are the gains and losses of textbooks.
+The level of a path is the mean of its power over element pairs. Each term belongs to a step (tower's antenna,
+reflections, spreading, UAV's antenna, polarisation) and is the ratio [dB] of the mean power after the step to the mean
+power before it. The terms therefore add up to the level for any arrays. With a single element at each end, the terms
+are the gains and losses of textbooks.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """A second, independent replay of single links: slow, one element pair at a time, for the audit.
 
-It follows the recommendations directly, and shares no code with the rest of this package. Rotations are products of
-three rotations, and arrays come from their published layout. The constants of ITU-R P.2040-4 and P.833 are typed in a
-second time. Reflections use components across and along the plane of incidence. Paths are found by trying every
-sequence of faces against the footprints, and chords in crowns by bisection. The inputs are the site, the settings and
-the poses. Antenna patterns are those of the replay: their formulas are checked with Sionna's patterns, and their tables
-by tests.
+This implementation follows the recommendations directly, and shares no code with the rest of the package. Rotations are
+products of three rotations, and arrays come from their published layout. The constants of ITU-R P.2040-4 and P.833 are
+typed in a second time. Reflections use components across and along the plane of incidence. Paths are found by trying
+every sequence of faces against the footprints, and chords in crowns by bisection. The inputs are the site, the settings
+and the poses. Antenna patterns are those of the replay: their formulas are checked with Sionna's patterns, and their
+tables by tests.
 """
 
 from __future__ import annotations
@@ -251,7 +251,7 @@ class Mirror:
         return _plus(p, self.normal, -2.0 * self.height(p))
 
     def box(self) -> tuple[Vector, Vector]:
-        """Return the minimum and maximum coordinates of the face. They are infinite for the ground."""
+        """Return the minimum and maximum coordinates of the face. The coordinates are infinite for the ground."""
         if self.roof is not None:
             west, south, east, north = self.roof.bounds
             return (west, south, self.offset_m), (east, north, self.offset_m)
@@ -701,8 +701,8 @@ def _p833(mhz: float) -> tuple[float, float]:
 def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -> float:
     """Return the length of a segment inside crowns (cones) or trunks (cylinders).
 
-    The largest of the signed distances from base, top and side is a convex function along the segment. Its minimum is
-    found by golden section, then the two ends of the chord by bisection.
+    The largest of the signed distances from base, top and side is a convex function along the segment. Golden section
+    finds the minimum of this function, and bisection the two ends of the chord.
 
     Parameters
     ----------

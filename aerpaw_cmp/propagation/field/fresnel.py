@@ -84,7 +84,7 @@ def reflection_coefficients(
     cos_theta : (...)
         Cosine of the angle of incidence, from the normal.
     permittivity : (...) complex
-        Relative permittivity. Its imaginary part is negative.
+        Relative permittivity. The imaginary part is negative.
     thickness_m : (...)
         Thickness of the slab [m], infinite for a half-space.
     wavelength : float

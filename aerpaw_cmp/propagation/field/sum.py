@@ -385,7 +385,7 @@ def amplitudes(
         Wavelength [m].
     record : callable, optional
         Called with the power (paths, pairs) of the "wave" after the tower and after each reflection, the "spreading" of
-        the amplitude, and the power of the "uav". It requires paths of one depth.
+        the amplitude, and the power of the "uav". With this argument, all paths must have the same depth.
 
     Returns
     -------

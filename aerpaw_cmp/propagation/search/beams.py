@@ -1,4 +1,4 @@
-"""A compiled search for all specular paths among thousands of faces. It extends sequences of faces along beams.
+"""A compiled search for all specular paths among thousands of faces. The search extends sequences of faces along beams.
 
 The source is mirrored at a first face. The beam from that image through the outline of the face is intersected with the
 tree of faces. The faces that it hits are candidates for the second face, and so on. At each step, the side planes of
@@ -10,8 +10,8 @@ processed one after the other, so that the memory does not grow with their numbe
 For thousands of prisms, compiled beams find candidates, which are then checked by the exact rules of the image engine.
 
 The tolerances of the beams are a thousand times wider than those of the image engine. A candidate is rejected only if a
-segment runs through the middle of a wall or roof. Nearly all remaining candidates are paths. They are tested as in
-:mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same paths.
+segment runs through the middle of a wall or roof. Nearly all remaining candidates are paths. The candidates are tested
+as in :mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same paths.
 """
 
 from __future__ import annotations

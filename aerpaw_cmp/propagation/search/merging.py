@@ -163,8 +163,8 @@ def next_leaf(lower, upper, child, todo, waiting, segment):  # type: ignore[no-u
     Parameters
     ----------
     lower, upper, child
-        Columns of a :class:`BoxTree`. They are passed separately, because compiled code would count references to a
-        tuple at every leaf.
+        Columns of a :class:`BoxTree`. The columns are passed separately, because compiled code would count references
+        to a tuple at every leaf.
     todo : (DEEPEST,) int
         Stack of nodes to visit. At the start it contains only the root, 0.
     waiting : int
@@ -383,7 +383,7 @@ def _lie_in(corners, first, after, plane, merge_m):  # type: ignore[no-untyped-d
 def _shared_planes(tree, corners, first, planes, area, order, bounds, merge_m):  # type: ignore[no-untyped-def]
     """Return, for each face, the face whose plane it uses.
 
-    This is a larger face that the face touches and in whose plane it lies, or else the face itself.
+    The result is a larger face that the face touches and in whose plane it lies, or else the face itself.
     """
     (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))

@@ -529,7 +529,7 @@ def gather(
         rank=_records(rank, lambda s: f"rank of {s.tower}"),
     )
     for place, stream in (*found.telemetry[:1], *found.placed):
-        check_place(site, place, stream)
+        check_place(site, place, stream.frame)
     _check_overlap(data)
     asked = tuple(site.cautions([series.tower for _, series in data.series]))
     if track is not None:
@@ -759,25 +759,25 @@ def _flown_track(site: Site, path: str, stream: Stream, settings: FlightFile) ->
 
 
 # A flight farther than this from every tower belongs to another site [m].
-FAR_M = 30_000.0
+_FAR_M = 30_000.0
 
 
-def check_place(site: Site, path: str, stream: Stream) -> None:
-    """Check that a flight is near a tower. Otherwise name the likely cause, such as swapped angles.
+def check_place(site: Site, path: str | Path, frame: pd.DataFrame, what: str = "flight") -> None:
+    """Check that a flight or route is near a tower. Otherwise name the likely cause, such as swapped angles.
 
     Raises
     ------
     InputError
-        If no position is within :data:`FAR_M` of any tower.
+        If no position is within :data:`_FAR_M` of any tower.
     """
-    latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
-    if not (near := nearest_m(site, latitude, longitude)) > FAR_M:
+    latitude, longitude = (frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
+    if not (near := nearest_m(site, latitude, longitude)) > _FAR_M:
         return
-    causes = [why for why, angles in misread(latitude, longitude).items() if nearest_m(site, *angles) <= FAR_M]
+    causes = [why for why, angles in misread(latitude, longitude).items() if nearest_m(site, *angles) <= _FAR_M]
     raise InputError(
         f"the positions are at least {near / 1000.0:.0f} km from every tower of site {site.name!r}",
-        expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",
-        cause=causes[0] if causes else "another site, or a log of another flight",
+        expected=f"a {what} within {_FAR_M / 1000.0:.0f} km of a tower",
+        cause=causes[0] if causes else f"another site, or another {what}",
         path=path,
     )
 

@@ -60,7 +60,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
         with stages("read"):
             site = choose_site(settings.site, flight.parent)
             vehicle, file, level, locks = _streams(settings, flight, options.logs_root, channel)
-            check_place(site, str(flight), vehicle)
+            check_place(site, flight, vehicle.frame)
             track = NodeFinder(site, vehicle).levels(level, floor_of(level, locks=locks))
         with stages("locate"):
             node, uav = _antennas(settings, flight, options.logs_root, track, (file, level))

@@ -25,7 +25,7 @@ from ..common.units import BoolArray, FloatArray
 from ..compare.calibration import BIN_S, Correction, Observed, Predictor, between_blocks_db, by_degree
 from ..compare.gains import NO_SPREAD, LinkSamples, LostLock, Spread, fading_of, link_directions
 from ..compare.level import DetectionForecast, nearest_points
-from ..flight.data import FAR_M, FlightData, load_data, nearest_m
+from ..flight.data import FlightData, check_place, load_data
 from ..flight.drafting.proposals import LearnedLink, latest_learned_links
 from ..flight.gains import flight_of, load_with_learned, pair_db
 from ..flight.replay import attitude_rotation, replay_poses
@@ -343,16 +343,8 @@ def _in_buildings(points: Targets, site: Site) -> list[str]:
 
 def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
     table = read_route(where, height_m=options.heights_m[0])
-    place = table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy()
-    east, north = site.frame.to_local(*place)
-    if (away_m := nearest_m(site, *place)) > FAR_M:
-        exchanged = nearest_m(site, *place[::-1]) <= FAR_M
-        raise InputError(
-            f"the route comes no nearer than {away_m / 1000.0:.0f} km to any tower of site {site.name!r}",
-            expected="latitude, longitude near the site",
-            cause="latitude and longitude are swapped" if exchanged else "a route in another area",
-            path=where,
-        )
+    check_place(site, where, table, "route")
+    east, north = site.frame.to_local(table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy())
     takeoff_m = site.takeoff_ground_m
     up = table["altitude_m"].to_numpy(np.float64) + takeoff_m
     up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)

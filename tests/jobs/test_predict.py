@@ -603,6 +603,7 @@ def test_a_heading_that_is_given_counts_then_that_of_the_route_else_all(tmp_path
     ("rows", "message"),
     [
         ("-78.696,35.7275,30\n-78.696,35.7285,40\n", "latitude and longitude are swapped"),
+        ("35.7275,78.696,30\n35.7285,78.696,40\n", "the sign of the longitude is wrong"),
         ("35.7275,-78.696,30\n35.7285,-78.696,-40\n", "1 of 2 points below the site's ground"),
     ],
 )

@@ -765,6 +765,16 @@ _FAR_M = 30_000.0
 def check_place(site: Site, path: str | Path, frame: pd.DataFrame, what: str = "flight") -> None:
     """Check that a flight or route is near a tower. Otherwise name the likely cause, such as swapped angles.
 
+    Parameters
+    ----------
+    site : Site
+    path : str or Path
+        File for the message.
+    frame : DataFrame
+        ``latitude_deg`` and ``longitude_deg`` of the positions.
+    what : {"flight", "route"}
+        What the positions are, for the message.
+
     Raises
     ------
     InputError

@@ -122,7 +122,7 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
         cells = [str(place.text or "").split() for place in named(shape, "coord")]
     else:
         texts = " ".join(str(places.text or "") for places in named(shape, "coordinates"))
-        # 'longitude, latitude' with a space is common and can mean nothing else
+        # accept 'longitude, latitude' with a space, which is common and not ambiguous
         cells = [place.split(",") for place in re.sub(r"\s*,\s*", ",", texts).split()]
     try:
         places = [tuple(float(cell) for cell in place) for place in cells]
@@ -155,7 +155,7 @@ def _triples(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
 
 # Colours of the classes: grey for out of coverage, then ranks 1 to 4 from dark to light (viridis), then spare colours.
 CLASS_COLOURS = ("#9e9e9e", "#440154", "#31688e", "#35b779", "#fde725", "#e66101", "#b2182b")
-# Date of all entries of an archive. It is fixed, so that the same content always produces the same bytes.
+# Date of all entries of an archive. The date is fixed, so that the same content always produces the same bytes.
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 

@@ -769,7 +769,7 @@ def _growing(e: LevelEvidence) -> FloatArray:
 
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield telemetry with other units, signs or columns than its reader assumes."""
+    """Yield trials in which the telemetry has other units, signs or columns than its reader assumed."""
     # a factor cannot explain heights that jump
     jumps = (np.abs(np.diff(e.place_m[:, 2])) > _JUMP_M + _FASTEST_MPS * np.diff(e.time_s)).any()
     step = "check the telemetry's columns and units"
@@ -995,7 +995,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
     """Yield missing detection, if many samples have the lowest level of the log."""
     if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
-        # levels that vary are noise. Their means over seconds vary less, so a margin above the median is enough.
+        # levels that vary are noise. Means over seconds vary less, so a margin above the median is enough.
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         sentence = f"{share:.0f} % of samples are at {Printed(level):.0f} {e.unit}: not detected"
         step = f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` {_IN_LOGS}"

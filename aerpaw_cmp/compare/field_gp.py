@@ -33,16 +33,16 @@ from .gains import USUAL_OFFSET_DB, GainFit, GainModel, LinkSamples, fit_gain, o
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
 
-# Prior standard deviation of the unknown mean. It is so large that it does not restrict the mean.
+# Prior standard deviation of the unknown mean. The value is so large that it does not restrict the mean.
 MEAN_SD_DB = 100.0
 
-# Largest number of rows that are used. Their covariance then takes 72 MB.
+# Largest number of rows that are used. The covariance of so many rows takes 72 MB.
 _MOST_ROWS = 3000
 
 # Largest number of rows per channel from which scales are fitted.
 FIT_ROWS = 700
 
-# Number of targets per block. It limits the memory that is used.
+# Number of targets per block. The number limits the memory that is used.
 AT_ONCE = 1024
 
 # Code of a flight without rows.

@@ -473,7 +473,7 @@ class GainFit:
         return across @ self._weights, self._factor.whiten(across.T), mean_part
 
 
-# Number of samples that are predicted together. It limits the memory that is used.
+# Number of samples that are predicted together. The number limits the memory that is used.
 AT_ONCE = 2000
 
 
@@ -633,10 +633,10 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
 # Step between candidate azimuths [deg].
 STEP_DEG = 10.0
 
-# Standard deviation of a bin about the patterns [dB]. It allows for a residual of 4 dB that is correlated over about
-# six bins. Least squares are used, because a covariance with learned gains or with shadowing over position would absorb
-# the broad shape over azimuth that determines a mount. With such a covariance, the azimuth at the UAV jumps between
-# flights of dataset 12 (320 and 120 deg instead of 270 and 270).
+# Standard deviation of a bin about the patterns [dB]. The value allows for a residual of 4 dB that is correlated over
+# about six bins. Least squares are used, because a covariance with learned gains or with shadowing over position would
+# absorb the broad shape over azimuth that determines a mount. With such a covariance, the azimuth at the UAV jumps
+# between flights of dataset 12 (320 and 120 deg instead of 270 and 270).
 _MOUNT_NOISE_DB = 10.0
 
 # Duration over which samples are averaged [s].
@@ -993,8 +993,8 @@ def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float
 BODY, MAST, PAIR = ANTENNA_TERMS
 
 # Smallest log odds of a learned gain against an unknown gain, and of an airframe against each rotated copy. On field
-# flights, the limit of 3 accepts the airframe of dataset 12 for LTE and AADM (6.8 to 8.3) and always refuses that of NR
-# (-11.5 to -1.2).
+# flights, the limit of 3 accepts the airframe of dataset 12 for LTE and AADM (6.8 to 8.3) and always refuses the
+# airframe of NR (-11.5 to -1.2).
 LEAST_ODDS = 3.0
 
 _TURNS_DEG = (90.0, 180.0, 270.0)

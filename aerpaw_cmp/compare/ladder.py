@@ -16,7 +16,7 @@ import numpy as np
 from ..common.units import BoolArray, FloatArray, IntArray
 from .statistics import FEWEST, Interval, PairedDifference, paired_difference, pooled_difference
 
-# Number of areas of a flight. It is a power of two, because areas are halved.
+# Number of areas of a flight. The number is a power of two, because areas are halved.
 _BLOCKS = 8
 
 # A model is compared only if it has a level for at least this share of the samples.

@@ -499,7 +499,7 @@ def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
     return np.asarray(sd_db * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi)))
 
 
-# Number of held-out segments of a flight. They have equal lengths.
+# Number of held-out segments of a flight. The segments have equal lengths.
 _SEGMENTS = 10
 
 _PENALTY = 1.0

@@ -18,7 +18,7 @@ from . import statistics
 # Largest rank in histograms. The modems of AERPAW report RI 1 to 4.
 MAX_RANK = 4
 
-# Number of matrix entries per SVD batch. It limits the memory that is used.
+# Number of matrix entries per SVD batch. The number limits the memory that is used.
 _CHUNK = 1 << 20
 
 

@@ -182,7 +182,7 @@ _CHOICE_PENALTY = 10.0
 # Smallest number of training samples for a fit.
 FEWEST = 50
 
-# Number of values in one batch of regressions. It limits the memory to about 100 MiB.
+# Number of values in one batch of regressions. The number limits the memory to about 100 MiB.
 _HELD = 1 << 22
 
 

@@ -352,7 +352,7 @@ class RankResult:
     @property
     def singular_ratio_db(self) -> FloatArray:
         """Ratios of all other singular values to the first, shape (n, m - 1) [dB]. These ratios determine the rank."""
-        with np.errstate(invalid="ignore"):  # 0 / 0 without a channel
+        with np.errstate(invalid="ignore"):  # without a channel, the ratio is 0 / 0
             return db_from_amplitude(self.sigma[:, 1:] / self.sigma[:, :1])
 
 

@@ -61,8 +61,8 @@ _CHORDS = ((0.2, 0.4, 0.8), (0.2, 0.45, 0.9))
 # Largest number of features per gain, and the share of the gain's variance that the features may miss.
 _FEATURES, _LEFT = 64, 0.01
 
-# Prior standard deviation of offset and slope, relative to that of the residual. It is so large that only the data
-# matter.
+# Prior standard deviation of offset and slope, relative to that of the residual. The value is so large that only the
+# data matter.
 _FREE = 1e3
 
 _MEMORY_S = (2.0, 5.0, 15.0, 40.0)
@@ -527,7 +527,8 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
     some = unit[:: max(1, len(unit) // 1500)]
     base = some[determining(some, covariance, _LEFT, _FEATURES)]
     out = np.full((len(direction), len(base)), np.nan)
-    # add a small diagonal against rounding errors. It has little effect, because the points are almost independent.
+    # add a small diagonal against rounding errors. The diagonal has little effect, because the points are almost
+    # independent.
     known = Factor.of(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out[finite] = known.whiten(covariance(unit, base).T).T
     return out

@@ -246,13 +246,13 @@ def _given_clock(receiver: str, lag_s: float) -> Clock:
     return Clock(result=result, applied_s=lag_s)
 
 
-# Number of times that are replayed together. It limits the memory on flights of more than half an hour.
+# Number of times that are replayed together. The number limits the memory on flights of more than half an hour.
 BLOCK = 100_000
 
 # Spacing [s] and largest number of the predictions for the clock. Long flights have a larger spacing.
 _CLOCK_STEP_S, _CLOCK_INSTANTS = 0.05, 40_000
 
-# Spacing for a tower that moves. It is larger, because every position of the tower is traced separately.
+# Spacing for a tower that moves. The spacing is larger, because every position of the tower is traced separately.
 _MOVING_CLOCK_STEP_S = 0.25
 
 

@@ -452,7 +452,7 @@ class RtSettings(StrictModel):
     advanced: AdvancedRt = AdvancedRt()
 
 
-# Widest search range of offsets [dB]. They are tried in steps of 0.1 dB.
+# Widest search range of offsets [dB]. Offsets are tried in steps of 0.1 dB.
 _WIDEST_DB = 100_000.0
 
 

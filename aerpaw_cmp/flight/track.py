@@ -141,7 +141,7 @@ _SPARSE_GAP = 2.0
 # Below this ground speed the course does not indicate the heading [m/s].
 _COURSE_SPEED_MPS = 1.0
 
-# Number of times whose poses are computed together. It limits the memory on flights of more than half an hour.
+# Number of times whose poses are computed together. The number limits the memory on flights of more than half an hour.
 AT_ONCE = 100_000
 
 # Velocities are computed from the positions this long before and after [s].
@@ -644,7 +644,7 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
 def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
     """Return logged velocities (east, north, up). Missing velocities are replaced by differences of positions over 4 s.
 
-    Over shorter times, the differences are mainly noise of the positions: at 10 Hz, a hover would have a speed.
+    Differences over shorter times are mainly noise of the positions, so that a hovering UAV would seem to move.
     """
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)

@@ -711,7 +711,10 @@ def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequenc
 
 
 def _flown(rows: Sequence[page.RssRow], order: Sequence[str], started: Mapping[str, int]) -> tuple[NodeOffset, ...]:
-    """Return the offsets of each tower and channel over the flights, minus their common part, and their steps."""
+    """Return the offsets of each tower and channel over the flights, and their steps.
+
+    The part that all have in common is subtracted.
+    """
     known = {(row.flight, row.link): row.moments.mean_db for row in rows}
     links = list(dict.fromkeys(row.link for row in rows))
     offsets = np.array([[known.get((flight, link), np.nan) for link in links] for flight in order])

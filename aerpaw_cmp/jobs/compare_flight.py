@@ -710,7 +710,7 @@ def _agreement_by_ground(
 
 
 def _on(site: Site, ground: Dem) -> Site:
-    """Return the site with towers, buildings and trees on another ground."""
+    """Return the site with another elevation model, on which towers, buildings and trees stand."""
     towers = {
         name: dataclasses.replace(tower, ground_m=float(np.nan_to_num(ground.ground_m(tower.east_m, tower.north_m))))
         for name, tower in site.towers.items()

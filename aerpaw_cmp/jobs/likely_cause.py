@@ -30,8 +30,8 @@ from ..site.site import Site
 
 _Key = TypeVar("_Key")
 _ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
-# Errors of the height that are tried [m]. They are closer together downwards, because levels change faster near the
-# ground.
+# Errors of the height that are tried [m]. The errors are closer together downwards, because levels change faster near
+# the ground.
 _RISES_M = (-150.0, -125.0, -100.0, -75.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
 
 
@@ -73,8 +73,8 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     cause = flight_cause(evidence)
     late = _late_clock(evidence)
     by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
-    # name a wrong clock rather than an antenna pattern, because the clock test allows for gains over directions. It
-    # does not allow for obstacles.
+    # name a wrong clock rather than an antenna pattern, because the clock test allows for gains over directions. The
+    # test does not allow for obstacles.
     if late is not None and (cause is None or CATCH_ALL in cause.name.split(" or ")):
         return late, None
     # errors that depend on direction are expected if a named antenna could not be used; a caution contains the reason

@@ -130,7 +130,7 @@ def _together(session: Callable[[int], TapSummary], count: int, stop: Stop) -> l
 
 
 def _names(paths: Sequence[str]) -> list[str]:
-    """Return short, unique names."""
+    """Return short, unique names for the ports of several modems."""
     names = [Path(path).name or path for path in paths]
     return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, 1)]
 

@@ -49,7 +49,7 @@ class LiveTwin:
         Parameters
         ----------
         flight : Path
-            flight.yaml. Its link, its tower and the middle K of its ``rank`` are used.
+            flight.yaml. The prediction uses the link, the tower and the middle K of ``rank`` in this file.
         telemetry : Path, optional
             The growing telemetry log. Default: the first telemetry log of the flight file.
         """

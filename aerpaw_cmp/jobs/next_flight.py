@@ -89,7 +89,7 @@ class PlanOptions:
     towers : tuple of str
         Towers whose antennas are considered, if no flight names them.
     target : TargetOptions
-        Heights, spacing and heading of a grid as target, and the site if no flight names it.
+        Heights, spacing and heading of the grid for which the flight is planned, and the site if no flight names it.
     """
 
     minutes: float = 15.0

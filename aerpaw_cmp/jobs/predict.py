@@ -65,7 +65,7 @@ from .sources import (
 # Number of headings with equal weights that are used if the heading is not known.
 HEADINGS = 8
 
-# Largest number of targets per block. It limits the memory that is used.
+# Largest number of targets per block. The number limits the memory that is used.
 AT_ONCE = 50_000
 
 # Column of the probability of lock, for receivers that can lose it.

@@ -20,8 +20,8 @@ import yaml
 from ..common.units import BoolArray, FloatArray
 from .records import Kind
 
-# Numbers that Android, modems, autopilots and scripts write for "not available". They are the ends of integer types,
-# including 28 bits (LTE cell identity) and 16 bits (MAVLink), and numbers like -999, which scripts write.
+# Numbers that Android, modems, autopilots and scripts write for "not available". These numbers are the ends of integer
+# types, including 28 bits (LTE cell identity) and 16 bits (MAVLink), and numbers like -999, which scripts write.
 UNAVAILABLE = (2147483647.0, -2147483648.0, 9223372036854775807.0, 268435455.0, 65535.0, -32768.0, -999.0, -9999.0)
 _ANY = (-np.inf, np.inf)
 
@@ -393,7 +393,7 @@ _DBUV_OF_0_DBM = 90 + 10 * float(np.log10(50.0))
 
 # Units that a name or a cell may have, by the unit after conversion, with their factors.
 _FACTORS = {unit: {word: float(factor) for word, factor in words.items()} for unit, words in _FILE["units"].items()}
-# Units of power, by their number of milliwatts. They are converted to dBm.
+# Units of power, by their number of milliwatts. Powers are converted to dBm.
 _POWERS = {"mw": 1.0, "w": 1e3, "uw": 1e-3, "\u00b5w": 1e-3, "nw": 1e-6, "pw": 1e-9}
 # For each unit, the unit after conversion, and the function that converts values to it.
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {

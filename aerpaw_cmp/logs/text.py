@@ -111,7 +111,7 @@ class Lines:
         return np.asarray(self.buffer[starts[:, None] + np.arange(width)])
 
 
-# Number of bytes that are searched at a time. They fit in the processor's cache.
+# Number of bytes that are searched at a time. So many bytes fit in the processor's cache.
 _SLICE = 1 << 17
 
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-# Number of targets whose samples are stacked at a time. It limits the memory that is used.
+# Number of targets whose samples are stacked at a time. The number limits the memory that is used.
 CHUNK = 512
 
 

@@ -34,7 +34,7 @@ from ..site.site import NEAREST
 # Horizontal interval d_rx of the UAV positions in the paper [m].
 PAPER_SPACING_M = 30.0
 
-# Limit of positions per side. It detects a mistyped spacing, because a map of 1e8 positions would take days.
+# Limit of positions per side. The limit detects a mistyped spacing, because a map of 1e8 positions would take days.
 _MAXIMUM_CELLS_A_SIDE = 10_000
 
 # The arrays of the paper have four elements at each end, so no channel matrix has a higher rank.
@@ -290,7 +290,7 @@ def in_name(number: float, digits: int = 0) -> str:
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
 
 
-# Section VII of the paper has levels at three heights. It also has ranks at 3 m, to show blockage.
+# Section VII of the paper has levels at three heights. The section also has ranks at 3 m, to show blockage.
 PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
 PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)

@@ -48,10 +48,11 @@ from ..common.errors import UsageError, from_python
 from ..common.grouping import lists_by_key
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 
-# Number of targets per query. It limits the memory that is used.
+# Number of targets per query. The number limits the memory that is used.
 QUERY_CHUNK = 4096
 
-# Number of targets per query of all samples within a radius. It limits the memory, and does not affect random draws.
+# Number of targets per query of all samples within a radius. The number limits the memory, and does not affect random
+# draws.
 AT_ONCE = 256
 
 # Distances that differ by less than this are tied, and a sample closer than this to a target is at the position of the

@@ -157,7 +157,7 @@ class Reach:
         places = [tower.position_m[:2] for tower in site.towers.values()]
         spans = (site.area_m, np.ravel(places), shapely.bounds(footprints).ravel())
         farthest = np.nanmax(np.abs(np.concatenate(spans)))
-        # corners (2, 3) of a box around the site in any rotation. It sets equal tolerances for all tiles.
+        # corners (2, 3) of a box around the site in any rotation. The box sets equal tolerances for all tiles.
         self.extent_m = np.sqrt(2.0) * farthest * np.array([[-1.0] * 3, [1.0] * 3])
         if self._every:
             return
@@ -329,7 +329,7 @@ class TileStore:
         chunks, tile = {}, np.minimum(self.tiling.cells, grid.shape).tolist()
         for name in planes:
             (*leading, _, _), kind = like[name].shape, like[name].dtype
-            # a broadcast number, which needs no memory. Its chunks are not written.
+            # a broadcast number, which needs no memory. Chunks of such an array are not written.
             fill = np.array(np.nan if kind.kind == "f" else 0, dtype=kind)
             store[name] = like[name].dims, np.broadcast_to(fill, (*leading, *grid.shape)), like[name].attrs
             chunks[name] = {"chunks": (*leading, *tile), "fill_value": fill.item(), "_FillValue": None}

@@ -179,11 +179,12 @@ _SHARPEST = 1e-6
 # as obstacles.
 _LEAST_WAVELENGTHS = 0.5
 
-# Distance from an edge point at which the program checks that there is air next to both faces [m]. It is far above the
-# rounding error of coordinates at 1 km, and far below the gap between two walls of a map.
+# Distance from an edge point at which the program checks that there is air next to both faces [m]. The distance is far
+# above the rounding error of coordinates at 1 km, and far below the gap between two walls of a map.
 _PROBE_M = 1e-3
 
-# Number of pairs of edge and pose that are examined together. It limits the memory, and does not change the result.
+# Number of pairs of edge and pose that are examined together. The number limits the memory, and does not change the
+# result.
 LINKS_AT_ONCE = 200_000
 
 
@@ -649,8 +650,8 @@ def _round_edge(
 ) -> tuple[ComplexArray, ComplexArray]:  # fmt: skip
     """Return fields (paths, elements) of an end in the edge-fixed basis, times the sine of the angle with the edge.
 
-    ``way`` (paths, 3) is the direction of the wave where the leg meets the edge. ``sign`` is 1 at the source, and -1 at
-    the target, whose elements are evaluated in the opposite direction.
+    ``way`` (paths, 3) is the direction of the wave where the leg meets the edge. ``sign`` is 1 at the source. At the
+    target it is -1, because the pattern is evaluated against the direction of the wave.
     """
     flat, cross = along - cosine[:, None] * way, np.cross(along, way)
     toward, normal = parts_of(way), parts_of(end.normal)

@@ -60,9 +60,9 @@ _FOLDERS = (
 
 _NAME = re.compile(r"libLLVM(?:-(?P<dash>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dot>\d+(?:\.\d+)*))?")
 
-# A program that traces a direct and a reflected path of known length over one ground triangle. It uses the same kinds
-# of instructions as Sionna's solver, so it aborts in the same way with LLVM 15 on AVX-512. Loading Sionna itself would
-# take 2 s.
+# A program that traces a direct and a reflected path of known length over one ground triangle. The program uses the
+# same kinds of instructions as Sionna's solver, so it aborts in the same way with LLVM 15 on AVX-512. Loading Sionna
+# itself would take 2 s.
 TRIAL_PROGRAM = """
 import json, math, sys
 try:
@@ -95,7 +95,7 @@ llvm = list(dr.detail.llvm_version()) if "llvm" in sys.argv[1] else []
 print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
 """
 
-# The program for ``doctor`` and ``make setup``. It also detects a Sionna RT that cannot be loaded.
+# The program for ``doctor`` and ``make setup``. This program also detects a Sionna RT that cannot be loaded.
 _SIONNA_LOADS = f"""{TRIAL_PROGRAM}
 import typing, typing_extensions
 typing.__dict__.setdefault("Self", typing_extensions.Self)

@@ -13,7 +13,7 @@ from ..common.units import BoolArray, FloatArray
 from .geometry import PathSet
 
 Engine = Literal["image", "sionna"]
-# Values of ``rt.diffraction``. Their searches are in :data:`aerpaw_cmp.propagation.edges.DIFFRACTION`.
+# Values of ``rt.diffraction``. The searches for these paths are in :data:`aerpaw_cmp.propagation.edges.DIFFRACTION`.
 Diffraction = Literal["none", "edges"]
 Samples = int | Literal["auto"]
 # ``loss(paths, sources_m, targets_m) -> (paths,)`` [dB], for the segments from source over ``paths.vertices_m`` to

@@ -122,8 +122,8 @@ def over_time(
     ----------
     data : ReportData
     panels : sequence of (mapping, sequence of mapping)
-        Ordinate with ``label`` and optional ``ends`` and ``ticks``, and the marks of each chart over the seconds after
-        the first time of the report.
+        For each chart: the vertical axis (``label``, and optionally ``ends`` and ``ticks``), and the marks over the
+        seconds since the first time of the report.
     high_in : sequence of float
         Height of each chart [inch].
 
@@ -175,7 +175,7 @@ def _spans(seconds: FloatArray, mask: BoolArray, name: str, **look: Any) -> dict
     return mark("spans", name, seconds[first] - half, ends=seconds[last] + half, **look)
 
 
-# Largest number of segments on a time axis. It exceeds the number of pixels.
+# Largest number of segments on a time axis. The number exceeds the pixels of the axis.
 _MOST_SPANS = 2000
 NO_PATH, SHADE = "out of coverage: no path in the simulation", "#DDDDDD"
 

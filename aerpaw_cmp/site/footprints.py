@@ -88,7 +88,7 @@ _ROW_SPACING_M = 10.0
 
 _MAXIMUM_ROW_TREES = 10_000
 
-# Number of outlines between two progress reports. They take a second on a slow machine.
+# Number of outlines between two progress reports. So many outlines take a second on a slow machine.
 _OUTLINES_PER_REPORT = 1000
 
 

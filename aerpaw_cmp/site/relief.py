@@ -397,8 +397,8 @@ _LENGTHS_M = np.geomspace(30.0, 2000.0, 9)
 # Both sequences have steps of about 65 %.
 _DEVIATIONS_M = np.geomspace(1.0, 50.0, 9)
 
-# Heights at positions within this distance [m] count as heights of one position. They contradict each other if they
-# differ by more than this number of standard deviations.
+# Heights at positions within this distance [m] count as heights of one position. Such heights contradict each other if
+# they differ by more than this number of standard deviations.
 _SAME_PLACE_M, _CONTRADICTION = 1.0, 4.0
 
 # Number of waves in a random surface.

@@ -19,7 +19,7 @@ from aerpaw_cmp.readers import AnyArray, Attribute, BoolArray, FloatArray, Rows,
 
 from . import _sheet
 
-# A column with more values than this does not name devices or networks. It is probably a counter.
+# A column with more values than this does not name devices or networks. Such a column is probably a counter.
 _MOST_PARTS = 64
 # At a handover a program updates its columns one after the other. A value in at most this number of rows, and in at
 # most this share of the rows of the other columns' key, is such a delay.
@@ -252,9 +252,9 @@ def few(texts: Iterable[str]) -> bool:
 
 
 # A column and the level alternate if the median step of the level within one value of the column is less than a share
-# of the median step between values. The share is _SMALLER, or _SELDOM if the value changes less than _FEWEST times.
-# They alternate in a fixed order if at least _IN_TURN of the rows repeat the order of the rows before. _FEWEST is also
-# the smallest number of rows.
+# of the median step between values. The share is _SMALLER, or _SMALLER_IF_RARE if the value changes less than _FEWEST
+# times. Column and level alternate in a fixed order if at least _IN_TURN of the rows repeat the order of the rows
+# before. _FEWEST is also the smallest number of rows.
 _SMALLER, _SMALLER_IF_RARE, _IN_TURN, _FEWEST = 0.5, 0.2, 0.8, 8
 
 

@@ -71,7 +71,7 @@ def ingest(
         show(f"wrote {out}{several}")
     if draft is not None:
         for remark in summary["draft"]:
-            # a line to check and a skipped log are warnings, which --quiet shows
+            # remarks about a line to check or a skipped log are warnings, which --quiet shows, too
             (say if remark.endswith("can be compared") else say.warn)(remark)
         for place in summary["drafts"]:
             show(f"wrote {place}")

@@ -1,11 +1,11 @@
 """A second, independent replay of single links: slow, one element pair at a time, for the audit.
 
-This implementation follows the recommendations directly, and shares no code with the rest of the package. Rotations are
-products of three rotations, and arrays come from their published layout. The constants of ITU-R P.2040-4 and P.833 are
-typed in a second time. Reflections use components across and along the plane of incidence. Paths are found by trying
-every sequence of faces against the footprints, and chords in crowns by bisection. The inputs are the site, the settings
-and the poses. Antenna patterns are those of the replay: their formulas are checked with Sionna's patterns, and their
-tables by tests.
+This implementation follows the recommendations directly, and shares no code with the rest of the package. Each rotation
+is computed as three rotations about single axes, and arrays come from their published layout. The constants of ITU-R
+P.2040-4 and P.833 are typed in a second time. Reflections use components across and along the plane of incidence. Paths
+are found by trying every sequence of faces against the footprints, and chords in crowns by bisection. The inputs are
+the site, the settings and the poses. Antenna patterns are those of the replay: their formulas are checked with Sionna's
+patterns, and their tables by tests.
 """
 
 from __future__ import annotations
@@ -319,7 +319,9 @@ class Blocks:
         self._shapes: dict[float, list[Polygon]] = {}
 
     def cut(self, a: Vector, b: Vector, grow_m: float, spared: tuple[int, ...] = ()) -> bool:
-        """Check whether a segment crosses a building. Buildings in ``spared``, on which it ends, are made smaller.
+        """Check whether a segment crosses a building.
+
+        The buildings ``spared``, on which the segment ends, are made smaller.
 
         Parameters
         ----------

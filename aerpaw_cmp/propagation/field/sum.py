@@ -30,7 +30,7 @@ from .fresnel import coefficients, face_table
 # Number of element pairs that NumPy evaluates at a time, so that their columns stay in the cache of a core.
 PAIRS_PER_CHUNK = 8_000
 
-# Number of paths that are evaluated together. It limits the memory, and does not change the result.
+# Number of paths that are evaluated together. The number limits the memory, and does not change the result.
 PATHS_PER_PART = 4096
 
 

@@ -24,7 +24,7 @@ from ...site.mitsuba import TriangleScene
 from ..compiled import kernel, part
 from ..geometry import BoxTree, Faces, Surfaces
 
-# Size of the stack of a tree search. It is twice the depth of a tree with 4e9 items.
+# Size of the stack of a tree search. The size is twice the depth of a tree with 4e9 items.
 DEEPEST = 64
 
 

@@ -88,7 +88,7 @@ def load_variant() -> str:
         import mitsuba as mi
     except Exception as error:
         raise _missing(error) from error
-    # Mitsuba first searches the working folder for plugins. These are native code, possibly from a third party.
+    # Mitsuba first searches the working folder for plugins. Plugins are native code, possibly from a third party.
     resolver: Any = mi.file_resolver
     resolver().clear()
     resolver().append(str(Path(mi.__file__).parent))

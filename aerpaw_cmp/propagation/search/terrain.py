@@ -225,7 +225,8 @@ def _stationary(
             after = (d - length + slope * (z - up[1])) / np.maximum(from_target, 1e-12)
             return np.asarray(before + after)
 
-        # evaluate the derivative at both ends of each piece of the profile. Its sign changes at most once in a piece.
+        # evaluate the derivative at both ends of each piece of the profile. The sign of the derivative changes at most
+        # once in a piece.
         ends = [growth(along[:-1], ground[:-1]), growth(along[1:], ground[1:])]
     turns = np.stack(ends, axis=1).reshape(-1, len(source))
     # a change of sign within a piece means a mirror on the piece; between two pieces, it means a mirror on the crease

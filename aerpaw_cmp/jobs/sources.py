@@ -7,10 +7,10 @@ links of all towers.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -538,7 +538,7 @@ class Flown:
         # the noise of a mean of n samples already contains 1/n of the variance of the fading
         count, means = sum(np.isfinite(s.residual_db).sum() for s in known), len(self.correction.channels[antenna].rows)
         sd_db *= math.sqrt(1.0 - min(means / count, 1.0))
-        return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
+        return replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
 
     def offset_db(self, antenna: str) -> float:
         """Return the mean of logged minus replayed levels [dB]."""
@@ -575,7 +575,7 @@ class Stored:
 
     def fading(self, antenna: str) -> Spread:
         """Return the error model of samples about their means over 4 s."""
-        return dataclasses.replace(self.known[antenna].spread, own_sd_db=0.0, noise_sd_db=0.0)
+        return replace(self.known[antenna].spread, own_sd_db=0.0, noise_sd_db=0.0)
 
     def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:
         """Return the forecast of a receiver that loses its lock, about levels in lock (n,) [dB]."""
@@ -637,11 +637,8 @@ class Prior:
     def sources(self) -> dict[str, Source]:
         """Return one link per tower, with isotropic ends and woods that attenuate."""
         rt, rss = RtSettings(foliage="attenuating"), RssSettings(field="power")
-        links = (
-            Source(tower=tower, channel="level", unit="dBm", link=self.link, site=self.site, rt=rt, rss=rss)
-            for tower in self.site.towers
-        )
-        return {source.antenna: source for source in links}
+        link = partial(Source, channel="level", unit="dBm", link=self.link, site=self.site, rt=rt, rss=rss)
+        return {f"{tower}.level": link(tower=tower) for tower in self.site.towers}
 
     def levels(self, each: Sequence[LinkSamples]) -> Levels:
         """Return level above free space and standard deviation (n,) [dB]. Isotropic antennas have no heading."""
@@ -651,7 +648,7 @@ class Prior:
 
     def fading(self, _antenna: str) -> Spread:
         """Return the error model of samples about their means over 4 s."""
-        return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_SD_DB["fading"])
+        return replace(NO_SPREAD, fading_sd_db=PRIOR_SD_DB["fading"])
 
 
 def outside_area(position_m: FloatArray, site: Site) -> BoolArray:

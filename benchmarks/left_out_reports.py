@@ -8,12 +8,15 @@ P(lock), rank.
 With ``--thirds`` the flights at LW1 are cut in three, and each third is drafted and reported alone. With ``--raw`` the
 flights of dataset 12 are written as AERPAW writes them: a power log per channel, and a vehicle log. With ``--locate``
 the rover of each AFAR flight is located by its levels, without learned antennas and with those of the other flights.
+With ``--teachers`` a site learns from one campaign only, and the script prints the antennas that it proposes for the
+flights of the others. NR and AFAR are controls: their antennas must not be proposed, nor other antennas for NR.
 
 At the end, or alone with ``--joint``, the calibration of all campaigns of one airframe is scored on held-out campaigns,
 flights, heights, sectors and headings. This is done with and without the one flight of AADM, and with rotated copies as
 a control. The goals are printed, too.
 
-    python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER] [--thirds | --joint | --raw | --locate]
+    python benchmarks/left_out_reports.py FIELD [--only TEXT] [--keep FOLDER]
+        [--thirds | --joint | --raw | --locate | --teachers]
 """
 
 import argparse
@@ -81,9 +84,10 @@ def recipe_of_campaign(name: str) -> Path:
 def without(recipe: Path, flights: Collection[str], folder: Path, campaigns: Collection[str] = ()) -> Path:
     """Write a calibration without some flights and campaigns, and return its path."""
     content = yaml.safe_load(recipe.read_text(encoding="utf-8"))
+    left_out = {Path(flight).name for flight in flights}
 
     def kept(names: Sequence[str]) -> list[str]:
-        return [str((recipe.parent / name).resolve()) for name in names if name not in flights]
+        return [str((recipe.parent / name).resolve()) for name in names if Path(name).name not in left_out]
 
     if "campaigns" in content:
         each = {
@@ -224,6 +228,31 @@ def show(log: Path, sentence: str, metrics: Mapping[str, Any], means: dict[str, 
             means.setdefault(key, []).append(value)
 
 
+def flights_of_campaign(name: str) -> list[Path]:
+    """Return the flight files that a campaign is learned from."""
+    recipe = recipe_of_campaign(name)
+    content = yaml.safe_load(recipe.read_text(encoding="utf-8"))
+    return [recipe.parent / flight for flight in content.get("campaigns", {}).get(name, content)["flights"]]
+
+
+def teachers(field: Path, folder: Path) -> None:
+    """Print the antennas that the draft of each flight proposes at a site that learned from one other campaign."""
+    names, draft = (*NAMES, "aadm"), folder / "flight.yaml"
+    for teacher in names:
+        site = folder / f"{teacher}_site.yaml"
+        shutil.copyfile(folder_of("lake_wheeler").with_suffix(".yaml"), site)
+        recipe = without(recipe_of_campaign(teacher), (), folder, {*names} - {teacher})
+        out = folder / f"{teacher}_calibrated.yaml"
+        if (done := run(["calibrate", recipe, "--into-site", site, "--logs-root", field, "-o", out])).returncode:
+            raise SystemExit(f"{teacher}: {done.stderr.strip()[-300:]}")
+        for pupil in names:
+            for flight in flights_of_campaign(pupil) if pupil != teacher else ():
+                logs = [field / log.path for log in load_flight(flight).logs]
+                run(["ingest", *logs, "--timezone", TIMEZONE, "--site", site, "--draft", draft, "--force"])
+                line = re.search(r"^(# )?antennas: .*", draft.read_text(encoding="utf-8"), re.MULTILINE)
+                print(f"{teacher} -> {flight.stem}: {line[0] if line else 'nothing to propose'}", flush=True)
+
+
 # Split, campaign, training without AADM: today's value is the first, the goal the last.
 GOALS = {
     ("campaign", "lte"): (6.93, 6.4), ("campaign", "dataset12"): (6.18, 5.6), ("campaign", "aadm"): (7.27, 6.8),
@@ -278,6 +307,7 @@ def main() -> None:
     parser.add_argument("--raw", action="store_true", help="dataset 12 as raw sounder and vehicle logs")
     parser.add_argument("--locate", action="store_true", help="the rover of each AFAR flight, by its levels")
     parser.add_argument("--joint", action="store_true", help="the joint calibration alone")
+    parser.add_argument("--teachers", action="store_true", help="antennas that each campaign proposes for the others")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         names = ("afar",) if asked.locate else NAMES[: 1 if asked.raw else 2 if asked.thirds else None]
@@ -285,18 +315,17 @@ def main() -> None:
         if asked.locate:
             lines = (asked.field / "sounder" / "rover_positions.txt").read_text(encoding="utf-8").splitlines()
             rovers = [(float(a), float(b)) for a, b in (line.split(",") for line in lines[:3])]
-        for name in () if asked.joint else names:
+        for name in () if asked.joint or asked.teachers else names:
             recipe, means = recipe_of_campaign(name), dict[str, list[float]]()
-            content = yaml.safe_load(recipe.read_text(encoding="utf-8"))
-            for flight in content.get("campaigns", {}).get(name, content)["flights"]:
-                if asked.only not in f"{name}/{flight}":
+            for flight in flights_of_campaign(name):
+                if asked.only not in f"{name}/{flight.name}":
                     continue
-                folder = (asked.keep or Path(scratch)) / name / Path(flight).stem
+                folder = (asked.keep or Path(scratch)) / name / flight.stem
                 site = folder / "site.yaml"
                 if not site.is_file():
                     folder.mkdir(parents=True, exist_ok=True)
-                    site_without(recipe, flight, asked.field, folder)
-                log = asked.field / load_flight(recipe.parent / flight).logs[0].path
+                    site_without(recipe, flight.name, asked.field, folder)
+                log = asked.field / load_flight(flight).logs[0].path
                 log = as_raw(log, folder / "raw") if asked.raw else log
                 if asked.locate:
                     found.append(located(log, site, folder, rovers[int(log.stem[-1]) - 1]))
@@ -311,7 +340,9 @@ def main() -> None:
             inside = int((values[:, 2] <= _CELL_M / np.sqrt(2.0)).sum())
             text = f"mean error {values[:, 0].mean():.1f} m, {inside} of {len(values)} inside the 90 % region"
             print(f"{case} learned antennas: {text}, largest radius {values[:, 1].max():.0f} m", flush=True)
-        if not (asked.thirds or asked.raw or asked.only or asked.locate):
+        if asked.teachers:
+            teachers(asked.field, Path(scratch))
+        elif not (asked.thirds or asked.raw or asked.only or asked.locate):
             joint(asked.field, Path(scratch))
 
 

@@ -855,7 +855,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
 def crps_difference(
     held_out: Mapping[tuple[str, str], _HeldOut], key: tuple[str, str], place_m: FloatArray | None
 ) -> tuple[float, Interval]:
-    """Return the mean CRPS of a base with a residual field minus that of the base alone, and its 95 % interval [dB].
+    """Return the mean change of the CRPS [dB] if a residual field is added to a base, and its 95 % interval.
 
     Parameters
     ----------

@@ -1144,7 +1144,8 @@ class FlightEvidence:
 def judged(own: float, of: Callable[[float], float]) -> Evidence:
     """Return the evidence from log likelihoods.
 
-    ``own`` is the log likelihood of an unknown gain, ``of(angle)`` that of a learned gain rotated by an angle [deg].
+    ``own`` is the log likelihood of an unknown gain, and ``of(angle)`` the log likelihood of a learned gain that is
+    rotated by an angle [deg].
     """
     learned = of(0.0)
     # skip the three rotated copies if the gain is already clearly worse

@@ -54,8 +54,8 @@ class RssComparison:
     n : int
         Number of compared pairs.
     n_out_of_coverage, n_measured_out, n_simulated_out : int
-        Numbers of samples with a known pose that are out of coverage in the measurement or the simulation, in the
-        measurement (no signal), and in the simulation (no path).
+        Numbers of samples with a known pose that are out of coverage: in at least one of measurement and simulation, in
+        the measurement (no signal), and in the simulation (no path).
     n_no_pose : int
         Samples without a pose, which are not compared.
     at_edge : bool
@@ -584,8 +584,9 @@ class DetectionScore:
         Floor of the receiver [unit of the measurement]. Lower levels are raised to it.
     n, n_detected : int
     brier, constant_brier, log_score, constant_log_score : float
-        Scores of P(detected) from the predicted level, and of a constant forecast: the share of this flight, which is
-        the best forecast without a level. The Brier score is between 0 and 1. The log score is in nat.
+        Scores of two forecasts of the detection. The first is P(detected) from the predicted level. The second is
+        constant: the share of this flight, which is the best forecast without a level. The Brier score is between 0 and
+        1. The log score is in nat.
     learned_on : str
         ``other flights``, or ``held-out segments`` if each segment of this flight is predicted from the others.
     offset_db, rmse_db : float

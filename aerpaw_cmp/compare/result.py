@@ -132,7 +132,7 @@ class SnrScore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RssFurther:
-    """Further numbers of a tower and channel, with their names in metrics.json, next to those of ``RssComparison``.
+    """Further numbers of a tower and channel, in addition to ``RssComparison``. The names are the same in metrics.json.
 
     A field without a default is always written. A field whose default is None is written only if it applies to the
     flight. ``n_flagged`` counts samples by reason. ``compared_with`` contains, for each baseline and each other

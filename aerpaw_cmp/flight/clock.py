@@ -168,7 +168,7 @@ class ClockEstimate:
     n : int
         Number of means of the level that were used.
     against_zero_nat : float
-        Log likelihood of the best lag minus that of the best lag within :data:`_SAME_S`.
+        Difference of two log likelihoods: of the best lag, and of the best lag of at most :data:`_SAME_S`.
     """
 
     radio_minus_telemetry_s: float

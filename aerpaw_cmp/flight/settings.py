@@ -216,7 +216,9 @@ class LinkSettings(StrictModel):
 
 
 class LinksSettings(StrictModel):
-    """The RSS and rank links. The defaults are those of the paper: single elements at 3.3 GHz, and 4 x 4 at 3.4 GHz.
+    """The RSS and rank links.
+
+    The defaults are the arrays of the paper: single elements at 3.3 GHz, and 4 x 4 at 3.4 GHz.
 
     Parameters
     ----------

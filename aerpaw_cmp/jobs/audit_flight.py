@@ -208,7 +208,7 @@ def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected
 
 
 def _settings_of(data: FlightData) -> list[RtSettings]:
-    """Return the settings of each replay: those of levels, then those of ranks."""
+    """Return the settings of each replay, first of the levels, then of the ranks."""
     return [data.settings.rt] * len(data.rss) + [data.settings.rank_rt] * len(data.rank)
 
 

@@ -631,7 +631,10 @@ def _score_all(
 def _controls_of(
     observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
 ) -> dict[str, tuple[Score, ...]]:
-    """Score the UAV's gain in wrong frames on held-out flights, as controls. ``scores`` are those of the body frame."""
+    """Score the UAV's gain in wrong frames on held-out flights, as controls.
+
+    ``scores`` are the scores in the body frame.
+    """
     if len(calibration.flights_of(observed)) < 2:
         return {}
     left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})

@@ -140,7 +140,7 @@ _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site
 
 
 def is_simulated(telemetry: Stream) -> bool:
-    """Check whether receiver and battery are those of ArduPilot's simulator, which AERPAW's emulator runs.
+    """Check whether receiver and battery belong to ArduPilot's simulator, which AERPAW's emulator runs.
 
     The log must contain at least two of its signs (fix 6, 10 satellites, few battery voltages), and contradict none.
     """

@@ -64,7 +64,7 @@ def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
 
     References
     ----------
-    .. [1] Akima, J. ACM 17 (1970) 589, doi:10.1145/321607.321609; the modification is that of MATLAB's ``makima``.
+    .. [1] Akima, J. ACM 17 (1970) 589, doi:10.1145/321607.321609; modified as in MATLAB's ``makima``.
 
     Examples
     --------

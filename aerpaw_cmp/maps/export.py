@@ -373,8 +373,8 @@ def _stacked(
     values : sequence of ndarray
         One array per mode.
     between : tuple of str
-        Dimensions of the values except the last. If they do not include ``"tower"``, the values are those of the
-        nearest tower.
+        Dimensions of the values except the last. If they do not include ``"tower"``, the values of the nearest tower
+        are written.
     attributes : mapping
 
     Returns

@@ -1,7 +1,7 @@
 """The files rss.nc and rank.nc of a report: the samples of rss.csv and rank.csv with units and the names of links.
 
 Dimensions are the names of :data:`_AXES` and ``obs``, the number of a sample in its series. Shorter series are filled
-with NaN up to the length of the longest. Variables are those of :mod:`.columns`, and a missing number is NaN.
+with NaN up to the length of the longest. The variables are the columns of :mod:`.columns`, and a missing number is NaN.
 """
 
 from __future__ import annotations

@@ -354,7 +354,7 @@ def _ascii_cells(line: str, gap: float, number: int) -> FloatArray:
 
 
 def _plausible(height_m: FloatArray, line: int | None = None) -> FloatArray:
-    """Return the heights. Raise InputError if one of them, other than a gap, cannot occur on Earth."""
+    """Return the heights. Raise InputError if a height, other than a gap, cannot occur on Earth."""
     wrong = height_m[(height_m < LOWEST_M) | (height_m > HIGHEST_M)]
     if wrong.size:
         raise InputError(

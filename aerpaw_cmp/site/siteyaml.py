@@ -4,8 +4,8 @@ docs/site.md describes every key. Polygons are ``polygon_m`` (east, north) or ``
 
 The files of a site are site.yaml and the files that it names. Outputs never replace these files, and reports list them.
 
-Trees are those of the paper (arXiv 2502.10324, section V): a trunk cylinder below a cone of vegetation, 20 m high and
-10 m wide, at random positions in forests. The paper does not print the height of the base of the crown, which is
+Trees are modelled as in the paper (arXiv 2502.10324, section V): a trunk cylinder below a cone of vegetation, 20 m high
+and 10 m wide, at random positions in forests. The paper does not print the height of the base of the crown, which is
 assumed to be a quarter of the height.
 """
 
@@ -724,7 +724,7 @@ def _trees(
     towers: Mapping[str, Tower],
     notes: list[str],
 ) -> tuple[Trees, Trees]:
-    """Return the trees of the site, and separately those of forest stands, which only opaque foliage uses."""
+    """Return the trees of the site, and separately the trees of forest stands, which only opaque foliage uses."""
     single = [(at, forest) for at, forest in enumerate(forests) if forest.height_m is None or forest.trees]
     # do not place trees inside houses or on masts; a union of all houses of a town takes seconds
     clear = shapely.union_all(

@@ -49,7 +49,7 @@ _TEXT = re.compile(_text.TIME)
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether a file is a MATLAB file whose first variables are those of a merged flight.
+    """Check whether a file is a MATLAB file that begins with the variables of a merged flight.
 
     In a file of version 7.3, names may be anywhere. Only names in the sniffed bytes are tested.
     """

@@ -31,7 +31,7 @@ _PLACE = ("latitude [ddmm.mmmm]", "lat dir", "longitude [ddmm.mmmm]", "lon dir")
 
 
 def sniff(head: bytes) -> bool:
-    """Check whether most of the first lines are sentences, and one of them has positions."""
+    """Check whether most of the first lines are sentences, and at least one sentence has positions."""
     return mostly(head, _BEGIN) and re.search(rb"\$..(?:GGA|GNS|RMC),", head) is not None
 
 

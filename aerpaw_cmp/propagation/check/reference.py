@@ -4,8 +4,8 @@ This implementation follows the recommendations directly, and shares no code wit
 is computed as three rotations about single axes, and arrays come from their published layout. The constants of ITU-R
 P.2040-4 and P.833 are typed in a second time. Reflections use components across and along the plane of incidence. Paths
 are found by trying every sequence of faces against the footprints, and chords in crowns by bisection. The inputs are
-the site, the settings and the poses. Antenna patterns are those of the replay: their formulas are checked with Sionna's
-patterns, and their tables by tests.
+the site, the settings and the poses. Only the antenna patterns are shared with the replay: Sionna's patterns check the
+formulas, and tests check the tables.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class ExpectedArray:
     patterns : tuple of Pattern
         Pattern of each element.
     mount : Matrix
-        Rotation from the device frame to that of its carrier (site or aircraft).
+        Rotation from the device frame to the frame of the site or aircraft that carries the device.
     """
 
     positions_m: tuple[Vector, ...]

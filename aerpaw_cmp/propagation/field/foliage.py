@@ -13,8 +13,9 @@ A forest stand is a forest with a height: crowns from ``crown_base_m`` up to ``h
 The field behind a stand has three components whose powers add up (ITU-R P.833-10 section 3.2): through the canopy, over
 the top, and around either side. The loss through the canopy depends on the length inside the canopy. The path over the
 top has two knife edges, where the ray enters and leaves the stand. Near the top, part of the Fresnel zone is in the
-canopy. There, the component through the canopy is computed for a ray that is lowered until its Fresnel zone is below
-the top, and the detours only add the missing power. The level therefore has no step where a ray leaves the canopy.
+canopy. The component through the canopy is then computed for a ray that is lowered until its Fresnel zone is below the
+top. The components over and around the canopy only add the missing power. The level therefore has no step where a ray
+leaves the canopy.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 The source is mirrored at a first face. The beam from that image through the outline of the face is intersected with the
 tree of faces. The faces that it hits are candidates for the second face, and so on. At each step, the side planes of
-the beam (those of the last face and the mirrored planes of earlier faces) select receivers from a separate tree. For
-the remaining receivers, the search computes the reflection points, and checks whether each point lies in its face, and
-whether a triangle cuts a segment. All cuts are conservative, so the paths do not depend on them. Pairs of faces are
+the beam select receivers from a separate tree. Side planes come from the last face, and, mirrored, from earlier faces.
+For the remaining receivers, the search computes the reflection points, and checks whether each point lies in its face,
+and whether a triangle cuts a segment. All cuts are conservative, so the paths do not depend on them. Pairs of faces are
 processed one after the other, so that the memory does not grow with their number.
 
 For thousands of prisms, compiled beams find candidates, which are then checked by the exact rules of the image engine.

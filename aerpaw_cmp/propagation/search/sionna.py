@@ -526,7 +526,7 @@ def own_coefficients(
 ) -> Coefficients:
     """Return Sionna's complex coefficient of each path, for the audit of the field.
 
-    The constants of P.2040, rotations, patterns, slants, Fresnel coefficients and spreading are those of Sionna. Only
+    The constants of P.2040, rotations, patterns, slants, Fresnel coefficients and spreading all come from Sionna. Only
     the carrier phase is computed here, from the path length in float64, because Sionna would compute ``2 pi f tau`` in
     float32.
 

@@ -4,7 +4,7 @@ At a specular point the length of the path over the ground is stationary. Along 
 is a polyline. Specular points on its pieces have a closed form, and the length can also be stationary at a crease
 between two pieces. Across the profile, the point is found by iteration on the bilinear surface. Points whose path
 lengths differ by less than half a wavelength lie in one Fresnel zone. They count as one mirror, at the point of the
-shortest path. The plane of the mirror is tangent to the surface. On a crease, it is the plane between both sides that
+shortest path. The plane of the mirror is tangent to the surface. On a crease, the plane lies between both sides and
 mirrors one end into the other. Where curved ground leaves the Fresnel zone of that plane, the reflection is reduced to
 the part of the zone that remains along the profile. The reflection is never focused, and the crest of a ridge does not
 reflect. Level ground at the height of the tower's ground is the same plane as without an elevation model.

@@ -186,7 +186,8 @@ def map_settings(site: str, chosen: Mapping[str, Any], *, quick: bool = False) -
         stated = {name: value for name, value in stated.items() if not name.startswith("threshold")}
     with nullcontext() if options else about_file(file, line):
         budget = LinkBudget(**stated | options)
-    return MapSettings(budget=budget, **(QUICK if quick else {}) | carrier | given)
+    study = {"study": budget == PAPER_BUDGET}  # it takes longer than the map, and a planner asks for coverage
+    return MapSettings(budget=budget, **study | (QUICK if quick else {}) | carrier | given)
 
 
 # A tile that a worker returns: maps by foliage mode, and the number of paths.

@@ -389,6 +389,8 @@ def test_options_replace_the_link_budget_of_the_site(tmp_path):
     changed = coverage_map.map_settings(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None}).budget
     assert (changed.tx_power_dbm, changed.threshold_snr_db, changed.level_dbm) == (23, None, -90.0)
     assert coverage_map.map_settings("lake_wheeler", {}).budget == PAPER_BUDGET
+    studied = (("lake_wheeler", {}), (str(file), {}), (str(file), {"study": True}))
+    assert [coverage_map.map_settings(*words).study for words in studied] == [True, False, True]
     file.write_text(file.read_text().replace("bandwidth_mhz: 10, ", ""))
     with pytest.raises(UsageError, match="without a bandwidth") as refused:
         coverage_map.map_settings(str(file), {})

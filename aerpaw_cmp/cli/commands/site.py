@@ -193,8 +193,12 @@ def map_(
     threshold_snr_db: Annotated[float | None, Option(help="Lowest SNR that counts as coverage [dB].")] = None,
     flights: Flights = None,
     study: Annotated[
-        bool, Option("--study/--no-study", help="Also study spatial correlation and interpolation.")
-    ] = True,
+        bool | None,
+        Option(
+            "--study/--no-study",
+            help="Also study correlation and interpolation  [default: if no power, bandwidth or threshold is given]",
+        ),
+    ] = None,
     tile_m: Annotated[
         float | None,
         Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),

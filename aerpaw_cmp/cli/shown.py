@@ -26,8 +26,8 @@ class ProgressLines:
     """Progress on standard error, so that standard output contains only results.
 
     On a terminal, progress is a bar with the remaining time. Elsewhere, a line is printed at each quarter and every
-    half minute. Text after a tab may change between calls. If ``quiet`` is set, only :meth:`warn` prints. If
-    ``as_json`` is set, standard output contains one JSON object.
+    half minute. Text after a tab may change while the same progress is shown. If ``quiet`` is set, only :meth:`warn`
+    prints. If ``as_json`` is set, standard output contains one JSON object.
     """
 
     def __init__(self) -> None:

@@ -737,7 +737,7 @@ def _attitude(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _height(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a constant and a growing error of the logged height."""
+    """Yield trials of two errors of the logged height: constant, and growing with time."""
 
     def words(rise: float) -> str:
         return f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says"

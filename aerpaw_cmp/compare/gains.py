@@ -414,7 +414,7 @@ class GainFit:
         )
 
     def sd_about_mean(self, samples: LinkSamples) -> FloatArray:
-        """Return the standard deviation of the gain along samples relative to its mean over them, shape (n,) [dB].
+        """Return the standard deviation (n,) of the gain at each sample about the mean over the samples [dB].
 
         Every sample must have both directions.
         """

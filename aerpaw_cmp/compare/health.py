@@ -326,7 +326,9 @@ _ODD_SD, _ODD_DB = 3.5, 4.0
 
 
 def level_of(channels: Sequence[Judged]) -> OddLevel | None:
-    """Return the channel whose offset, or difference from another channel, is most unusual. None if all are usual.
+    """Return the channel whose offset, or difference from another channel, is most unusual.
+
+    None if no channel is unusual.
 
     The difference of two channels varies less than the offset of each, because offsets depend on the gain setting of
     the flight.

@@ -109,8 +109,8 @@ CALM = 1.8
 # 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
-# Smallest widening factor, with which the interval contains 80 % of the draws. Without this limit, the factor could
-# reach 0 for an unusual mixture of correlations.
+# Smallest widening factor. An interval with this factor contains 80 % of the draws. Without this limit, the factor
+# could reach 0 for an unusual mixture of correlations.
 _LEAST_STRETCH = 0.6
 
 # Draws come in pairs of opposite sign, so that swapping two models reverses an interval exactly.
@@ -511,8 +511,9 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
     -------
     share, ratio : float
         Share of the samples in the loud parts, and the mean square of these samples divided by the mean square of all
-        others. 0 and 1 if the sequence is steady. At least two parts must be loud by the innovations of a second-order
-        autoregression, which are hardly correlated, and by their own mean square.
+        others. 0 and 1 if the sequence is steady. At least two parts must be loud by two criteria: the mean square of
+        the errors, and the mean square of the innovations of a second-order autoregression, which are hardly
+        correlated.
     """
     away = values - values.mean()
     if len(away) < _FEWEST_FOR_PARTS or not away.any():
@@ -730,7 +731,7 @@ def spread_interval(values: FloatArray, place_m: Track = None) -> Interval:
     """Return the 95 % interval of the standard deviation of a correlated sequence (n,) in time order.
 
     If the interval is wider than :data:`_BOUND` times the value, its upper end is infinite, so that it is a lower
-    bound. Positions ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
+    bound. Positions ``place_m`` (n, 3) [m] are used as in :func:`mean_draws`.
     """
     if len(values) < FEWEST:
         return NO_INTERVAL

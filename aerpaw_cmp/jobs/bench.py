@@ -173,9 +173,9 @@ def path_search_ratios(rows: Sequence[Row]) -> dict[str, Row]:
     Returns
     -------
     dict
-        Sionna rows with their ``ratio``: by the number of samples (``1e3``), and as ``equal_error`` the row with the
-        fewest samples that find as many paths as the most samples. A comparison with more samples would favour the
-        image engine. Empty without Sionna rows.
+        Sionna rows with their ``ratio``, by the number of samples (``1e3``). The key ``equal_error`` has the row with
+        the smallest number of samples that finds as many paths as the largest number. A comparison with more samples
+        would favour the image engine. Empty without Sionna rows.
     """
     image = next(row for row in rows if row["engine"] == "image" and row["depth"] == _DEPTH)
     sionna = [

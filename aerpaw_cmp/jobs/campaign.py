@@ -209,7 +209,7 @@ def digest_of(task: Task) -> str:
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
-    """Return a stored outcome with the names of ``task``, and without samples except for the first setting.
+    """Return a stored outcome with the flight and the setting of ``task``. Only the first setting keeps its samples.
 
     For all other settings, the rows contain only numbers, because the samples of thousands of tasks would not fit in
     memory.
@@ -422,7 +422,7 @@ def run(
     ----------
     campaign : CampaignFile
     folder : Path
-        Folder for the paths of flight files.
+        Folder to which relative paths of flight files refer.
     options : RunOptions
     keep : Path, optional
         Folder of stored outcomes. Outcomes are read from it and added to it.

@@ -102,7 +102,7 @@ def tap_modems(
 
 
 def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, title: str) -> None:
-    """Build the page, serve it until the stack ends, and print its address."""
+    """Build the page, print its address, and serve the page until ``stack`` is closed."""
     from ..live.web import Address, Page, WebServer
     from ..report.live import live_page
 

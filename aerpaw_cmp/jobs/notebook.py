@@ -49,7 +49,7 @@ def open_flight(
     path : path
         A flight.yaml, or a flight file (HDF5) of ``ingest -o`` or ``Logs.write``.
     logs_root : path, optional
-        Folder for the paths of logs. Default: the folder of the flight file.
+        Folder to which relative paths of logs refer. Default: the folder of the flight file.
     overrides : mapping, optional
         Changed keys of the flight file in dotted form: ``{"rt.max_depth": 1, "rss.lag": "off"}``.
     flight : str, optional
@@ -106,7 +106,7 @@ class Flight:
     data : FlightData
         Settings, site, logs, track and series.
     logs_root : Path, optional
-        Folder for the paths of logs.
+        Folder to which relative paths of logs refer.
     written : FlightFile, optional
         Settings of the flight file before learned antennas are added. Default: those of ``data``.
     changed : tuple of str

@@ -710,7 +710,7 @@ def corrected_maps(
         The site, as for the command ``map``.
     spacing_m : float
     heights_m : (sequence of float, sequence of float)
-        Heights of levels, and of ranks.
+        Heights at which levels are predicted, and heights at which ranks are predicted.
     flights : sequence of NamedFlight
         Flights to learn from.
     logs_root : Path, optional

@@ -194,7 +194,7 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
     site : Site
     options : TargetOptions
     logs_root : Path, optional
-        Folder for the paths of logs in a flight file.
+        Folder to which relative paths of logs in a flight file refer.
 
     Returns
     -------
@@ -419,7 +419,7 @@ class Source:
     link : LinkSettings
     site : Site
     folder : Path
-        Folder for the paths of antenna files.
+        Folder to which relative paths of antenna files refer.
     rt, rss : RtSettings, RssSettings
         Settings of the replay and of the sum of its paths.
     samples : tuple of LinkSamples

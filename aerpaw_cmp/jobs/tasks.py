@@ -48,7 +48,7 @@ def other_inputs(
     flight : Path
         The flight file.
     logs_root : Path, optional
-        Folder for the paths of logs and antenna files, in addition to the folder of the flight file.
+        Folder to which relative paths of logs and antenna files may also refer, besides the folder of the flight file.
     learned : Path, optional
         calibrated.yaml of ``report --with``.
 

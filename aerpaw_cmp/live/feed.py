@@ -114,7 +114,7 @@ class _Modem:
     sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=64))
     open: dict[str, Alarm] = field(default_factory=dict)
 
-    # the status also contains the first four, but a record may be newer
+    # a status also contains the first four values, but the values of a record may be newer
     _SHOWN = ("connected", "rank", "rsrp_dbm", "sinr_db", "name", "port", "predicts", "offset_db", "inside", "ended")
 
     @property

@@ -250,7 +250,7 @@ def _split(name: str, what: Meaning | None) -> tuple[str, str]:
 def with_places(columns: Iterable[tuple[str, Meaning | None]]) -> list[Meaning | None]:
     """Return the meanings of columns.
 
-    Levels and identities whose names otherwise have the same words get the same ``place``.
+    A level and an identity get the same ``place`` if all other words of their names are the same.
 
     If a place has several identities, such as "PCI A" and "PCI B", it has several cells: "RSRP A" is the level of the
     first cell.

@@ -84,7 +84,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
-    """Return the content of a packed file, and other content unchanged."""
+    """Return the content of a file: unpacked if it is a packed file, otherwise unchanged."""
     most = min(MAX_BYTES, packed.most_bytes(len(raw)))
     return raw if packed.packed_form(raw) is None else packed.unpacked(raw, path, most)
 

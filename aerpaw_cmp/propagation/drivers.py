@@ -82,7 +82,7 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
         if progress is not None:
             progress(finished / count)
     first = replays[0]
-    # terrain planes are numbered in order of first use, so one number means different planes in the parts
+    # each part numbers its terrain planes in order of first use, so the same number means different planes in two parts
     faces, shifted = _joined_faces(replays)
     pieces = [shifted, *zip(*(part.further for part in replays), strict=True)]
     further: dict[str, Any] = {

@@ -2,9 +2,9 @@
 
 This module uses only the standard library, so that set-up can use it before other packages work.
 
-A trial is necessary. Dr.Jit 1.5 refuses LLVM 14 and loads LLVM 15 and 16, but on machines with AVX-512 these two abort
-the process in the first solver call ("Cannot select: fmaximum"). An abort cannot be caught. The choice is therefore
-tried in a child process with an empty kernel cache, because a cached kernel would hide the fault.
+Each version is tried before it is used. Dr.Jit 1.5 refuses LLVM 14 and loads LLVM 15 and 16, but on machines with
+AVX-512 these two abort the process in the first solver call ("Cannot select: fmaximum"). An abort cannot be caught. The
+trial therefore runs in a child process with an empty kernel cache, because a cached kernel would hide the fault.
 """
 
 from __future__ import annotations

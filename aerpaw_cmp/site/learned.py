@@ -68,7 +68,8 @@ class Errors(StrictModel):
     Parameters
     ----------
     airframe_rmse_db : float, optional
-        RMSE of the airframe of other campaigns alone, on the flights of this campaign [dB].
+        RMSE on the flights of this campaign, if only the gain of the airframe is used and was learned from other
+        campaigns [dB].
     """
 
     series: int

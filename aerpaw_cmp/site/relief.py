@@ -232,7 +232,8 @@ class Dem:
         source_m, target_m : (links, 3)
             East, north, up [m].
         tolerance_m : float or (links,)
-            Ground that is higher than a line by at most this does not block it. Ground below the ends never blocks.
+            Ground that is higher than a line by at most this does not block it. The ground directly below the two ends
+            never blocks.
 
         Returns
         -------

@@ -554,7 +554,7 @@ def has_date_in_parts(names: Iterable[str]) -> bool:
 
 
 def _join_times(sheet: Sheet) -> None:
-    """Add a column of dates, with the time of day if possible, if year, month and day have columns."""
+    """If year, month and day are separate columns, add a column of dates, with the time of day if possible."""
     year, month, day = date = [sheet.named(*words) for words in _DATE_PARTS]
     clock = [sheet.named(*words) for words in _CLOCK_PARTS]
     if year is None or day is None or sheet.find("date") is not None:

@@ -31,7 +31,7 @@ _MIXED = "srsENB prints the truncated mean of the ranks reported in a second: 1 
 
 
 def _streams(rows: Rows) -> Iterator[Stream | None]:
-    """Yield the rank ``srsenb``, with the number of transmit channels in the console as the largest rank."""
+    """Yield the rank ``srsenb``. The largest possible rank is the number of transmit channels in the console."""
     ri = rows.number("ri")
     rows.warnings += [_MIXED] if (ri > 0).any() else []
     last = int(rows.row[-1]) if len(rows) else 0

@@ -248,7 +248,7 @@ class NodeFinder:
                 learned_odds = max(self._learned_odds(track, tower.name, each) for each in fitting) - np.log(
                     len(fitting)
                 )
-                # make the odds relative to any position, like all other odds
+                # express the odds against a tower at any position, as all other odds
                 learned_odds -= estimate.anywhere + _LEARNED_MORE
                 known[i] = learned_odds if learned_odds >= _TOWER_ODDS else -np.inf
                 odds_tower[i] = max(odds_tower[i], learned_odds)

@@ -1,13 +1,13 @@
-"""An audit of one engine by the other on a sample of links, and of the fields of the replay by two references.
+"""The audit of a replay: one engine checks the paths of the other on a sample of links, and two references the fields.
 
 The fields of a replay are compared with Sionna's own coefficients and with a second implementation.
 
 1. *Sionna* traces the audited links again and returns a complex coefficient for each path. Sionna uses an element at
-each array centre with both slants, and its own materials, patterns and rotations. The results are float32: entries must
-agree within ``_ENTRY_TOLERANCE`` of the strongest entry, and phases within ``_PHASE_TOLERANCE_RAD`` on paths shorter
-than ``_PHASE_RANGE_M``. 2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the
-settings: their paths, H of every element pair with foliage, RSS and rank. Both implementations use float64, so only
-rounding may differ.
+   each array centre with both slants, and its own materials, patterns and rotations. The results are float32: entries
+   must agree within ``_ENTRY_TOLERANCE`` of the strongest entry, and phases within ``_PHASE_TOLERANCE_RAD`` on paths
+   shorter than ``_PHASE_RANGE_M``.
+2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the settings: their paths, H
+   of every element pair with foliage, RSS and rank. Both implementations use float64, so only rounding may differ.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Share of the 90 % regions of `locate` that contain the node, over simulated flights in ten worlds.
+"""Share of the 90 % regions of `locate` that contain the node, over simulated flights in ten worlds and a mixed one.
 
 A flight has a route (lawnmower, circle, or line there and back), a node near it, and a path-loss exponent. Its levels
 have two rays over the ground, shadowing that is correlated over place, and fading. Some worlds also have antenna
-patterns at both ends, a receiver floor, a mast or a node far outside. `locate` does not know any of them. A flight
-takes 0.3 s.
+patterns at both ends, a receiver floor, a mast or a node far outside. In the mixed world, these properties are drawn
+for each flight, and the shares are also printed by the node's distance from the track. `locate` does not know any of
+the properties. A flight takes 0.3 s.
 
     python benchmarks/located_nodes.py [--flights 30] [--seed 1] [--only TEXT]
 """
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import interpn
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.locate import LevelTrack, level_track, locate
@@ -64,6 +66,17 @@ WORLDS: Mapping[str, World] = {
     "circle": World(route="circle"),
     "line": World(route="line"),
 }
+
+MIXED, RINGS_M = "mixed", ((0.0, 100.0), (100.0, 200.0), (200.0, 300.0), (300.0, np.inf))
+
+
+def mixed(rng: np.random.Generator) -> World:
+    """Return a world whose properties are drawn. The ranges are wider than those of the other worlds."""
+    shadow_db, shadow_m, lobes = rng.uniform((0.5, 20.0, 1.0), (12.0, 130.0, 4.0))
+    return World(
+        exponent=(1.8, 3.8), shadow_db=shadow_db, shadow_m=shadow_m, lobes=lobes, outside=bool(rng.random() < 0.25),
+        pattern_db=rng.choice((0.0, 3.0, 8.0, 11.0)), below_floor=rng.choice((0.0, 0.0, 0.25, 0.6)),
+    )  # fmt: skip
 
 
 def route(kind: str, rng: np.random.Generator) -> FloatArray:
@@ -129,21 +142,20 @@ def flight(world: World, rng: np.random.Generator) -> tuple[LevelTrack, FloatArr
 
 def flights(name: str, count: int, seed: int) -> Iterator[tuple[LevelTrack, FloatArray]]:
     """Return the flights of a world. Equal seeds make equal flights."""
-    rng = np.random.default_rng([seed, list(WORLDS).index(name)])
-    return (flight(WORLDS[name], rng) for _ in range(count))
+    rng = np.random.default_rng([seed, [*WORLDS, MIXED].index(name)])
+    return (flight(WORLDS.get(name) or mixed(rng), rng) for _ in range(count))
 
 
-def judged(track: LevelTrack, at: FloatArray) -> tuple[float, float, float, bool]:
-    """Return the share of the posterior in cells likelier than the node's, error and radius [m], and ``placed``."""
+def judged(track: LevelTrack, at: FloatArray) -> tuple[float, float, float, bool, float]:
+    """Return the share of the posterior in cells likelier than the node's, error, radius [m], and ``placed``.
+
+    The last number is the node's distance from the track [m].
+    """
     estimate = locate(track)
-    regions = estimate.regions
-    column, row = (
-        int(np.abs(axis - x).argmin()) for axis, x in zip((regions.east_m, regions.north_m), at, strict=True)
-    )
-    cell = float(np.diff(regions.east_m[:2])[0])
-    away = abs(regions.east_m[column] - at[0]), abs(regions.north_m[row] - at[1])
-    likelier = regions.likelier()[column, row] if max(away) <= cell else 1.0
-    return likelier, float(np.hypot(*(estimate.place_m[:2] - at))), estimate.radius90_m, estimate.placed
+    regions, away_m = estimate.regions, float(np.hypot(*(track.position_m[:, :2] - at).T).min())
+    axes, held = (regions.east_m, regions.north_m), regions.likelier()
+    likelier = float(interpn(axes, held, at, "nearest", bounds_error=False, fill_value=1.0)[0])
+    return likelier, float(np.hypot(*(estimate.place_m[:2] - at))), estimate.radius90_m, estimate.placed, away_m
 
 
 def main() -> None:
@@ -154,15 +166,18 @@ def main() -> None:
     parser.add_argument("--only", default="", help="worlds whose name contains this text")
     args = parser.parse_args()
     print(f"{'world':36s} 90 % has node  50 %  error [m]  radius [m]  not placed")
-    for name in [name for name in WORLDS if args.only in name]:
+    for name in [name for name in (*WORLDS, MIXED) if args.only in name]:
         rows = [judged(*simulated) for simulated in flights(name, args.flights, args.seed)]
-        shares, errors, radii, placed = (np.array(values) for values in zip(*rows, strict=True))
+        shares, errors, radii, placed, away = (np.array(values) for values in zip(*rows, strict=True))
         inside = [100.0 * float((shares[placed] < part).mean()) for part in (0.9, 0.5)]
         middle = [float(np.median(values[placed])) for values in (errors, radii)]
         print(
             f"{name:36s} {inside[0]:10.1f} % {inside[1]:5.1f} {middle[0]:10.0f} {middle[1]:11.0f} {(~placed).sum():9d}",
             flush=True,
         )
+        for near, far in RINGS_M if name == MIXED else ():
+            ring = placed & (near <= away) & (away < far)
+            print(f"  node {near:g} to {far:g} m from the track: {(shares[ring] < 0.9).sum()} of {ring.sum()}")
 
 
 if __name__ == "__main__":

@@ -199,21 +199,14 @@ def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_
     assert (grid.min(axis=0).tolist(), grid.max(axis=0).tolist()) == ([-400.0, -300.0], [600.0, 540.0])
     assert set(np.diff(np.unique(grid[:, 0]))) == set(np.diff(np.unique(grid[:, 1]))) == {40.0}
     assert len(grid) == 26 * 22
-    for place, edge in (
-        ((-361.0, 0), 1),
-        ((-360.0, 0), 0),
-        ((561.0, 0), 1),
-        ((560.0, 0), 0),
-        ((0, 501.0), 1),
-        ((0, -261), 1),
-    ):
+    edges = {(-361.0, 0.0): 1, (-360.0, 0.0): 0, (561.0, 0.0): 1, (560.0, 0.0): 0, (0.0, 501.0): 1, (0.0, -261.0): 1}
+    for place, edge in edges.items():
         assert locating._on_edge(np.array([[*place, 1.5]]), grid, spacing).tolist() == [bool(edge)]
     far = np.array([[0.0, 0.0], [500.0, 0.0]])
     # all here; five percent far away: 18 in 19 of the others are within; twenty percent: half of those far away
     for shares, radius in (((1, 0), 20 * np.sqrt(-2 * np.log(0.1))), ((0.95, 0.05), 20 * np.sqrt(-2 * np.log(1 / 19))),
                            ((0.8, 0.2), 500.0)):  # fmt: skip
-        regions = locating.Regions.of(far, np.array(shares))
-        assert regions.radius_m(far[0], 0.9) == pytest.approx(radius, abs=1.5)
+        assert locating.Regions.of(far, np.array(shares)).radius_m(far[0], 0.9) == pytest.approx(radius, abs=1.5)
     moved = locating._divided(np.array([[0.0, 0.0, 1.5], [100.0, 40.0, 10.0]]), (-40 / 3, 0.0, 40 / 3))
     steps = {(e, n, 1.5) for e in (-1, 0, 1) for n in (-1, 0, 1)}
     assert {tuple(row) for row in np.round(moved[:9] / [40 / 3, 40 / 3, 1], 9).tolist()} == steps

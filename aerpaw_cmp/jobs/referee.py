@@ -685,7 +685,7 @@ def _why_none(given: ForeignPrediction, data: FlightData, result: FlightResult) 
 
 
 def _wrong_heights(given: ForeignPrediction, data: FlightData, result: FlightResult) -> str | None:
-    """Return the likely error of the predicted heights, if most samples are near a prediction after its correction."""
+    """Return the likely error of the predicted heights, if its correction brings predictions near the samples."""
     if given.timed:
         return None
     flown = np.vstack([s.position_m[np.isfinite(s.position_m).all(axis=1)] for s in result.series])

@@ -194,10 +194,7 @@ def map_(
     flights: Flights = None,
     study: Annotated[
         bool | None,
-        Option(
-            "--study/--no-study",
-            help="Also study correlation and interpolation  [default: if no power, bandwidth or threshold is given]",
-        ),
+        Option("--study/--no-study", help="Study correlation and interpolation  [default: without power, threshold]"),
     ] = None,
     tile_m: Annotated[
         float | None,

@@ -90,7 +90,7 @@ class Dataset:
     Parameters
     ----------
     variables : mapping
-        Dimensions (a single one may be its name), values, attributes and encoding, by name.
+        For each name: dimensions (or the name of the only one), values, attributes and encoding.
     attributes : mapping
         Attributes of the file.
     """

@@ -465,7 +465,7 @@ class Regions:
 
     @classmethod
     def of(cls, places: FloatArray, share: FloatArray, sd_m: float = SYSTEMATIC_M) -> Regions:
-        """Return the regions of shares (m,) at positions (m, 2 or more), blurred by the SD ``sd_m`` per axis [m]."""
+        """Return the regions for a posterior: shares (m,) at positions (m, 2 or more), blurred by ``sd_m`` [m]."""
         reach = 4.0 * sd_m
         area = float(np.prod(np.ptp(places[:, :2], axis=0) + 2.0 * reach))
         cell = max(_CELL_M * sd_m / SYSTEMATIC_M, float(np.sqrt(area / _MOST_CELLS)))

@@ -365,11 +365,11 @@ class Channels:
 
         The terms of the sequence are the sum of the terms of its channels. If channels are independent, the outer
         products of the terms of each channel add up to the covariance of the sum on average, even if the channels have
-        different correlations, powers or numbers of samples. Their likelihood then counts like that of several
-        sequences, whose number follows from the powers and correlations of the channels. However, if channels have
-        common fading and separate noise, their sum is correlated in another way than each channel. Therefore the
-        weights are a mixture of these likelihoods and of the weights for a single sequence. The likelihoods of the
-        channels have a small weight if the power of the sum is not the sum of the powers.
+        different correlations, powers or numbers of samples. The likelihood of a pooled sequence then counts like the
+        likelihood of several sequences, whose number follows from the powers and correlations of the channels. However,
+        if channels have common fading and separate noise, their sum is correlated in another way than each channel.
+        Therefore the weights are a mixture of these likelihoods and of the weights for a single sequence. The
+        likelihoods have a small weight in this mixture if the power of the sum is not the sum of the powers.
         """
         from scipy.fft import dct
 

@@ -681,7 +681,7 @@ def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1
 
 
 def _differences_mps(t: FloatArray, position_m: FloatArray, span_s: float) -> FloatArray:
-    """Return the velocity (n, 3) at ascending times from positions ``span_s``, or one row, before and after."""
+    """Return the velocity (n, 3) from positions ``span_s`` before and after each time, or in the neighbouring rows."""
     early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
     # use at least one row on each side, because sparse telemetry has no row within the span
     early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))

@@ -623,7 +623,7 @@ def run_flight(
 
 
 def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
-    """Return the stages of a report for its dry run. ``figures`` is the option of the report.
+    """Return the stages of a report for its dry run. ``figures`` is the value of ``--figures``.
 
     One pose of every series is replayed and the receiver is read, so that errors of the run appear in the dry run.
     """

@@ -446,7 +446,7 @@ def _curve(
 
 
 def _of_length(candidate: Candidate, share: float, area: Any, plan: PlanOptions) -> Route | None:
-    """Return a candidate for a share of the battery, or None if the route of a file is shorter than that."""
+    """Return a candidate for a share of the flight time, or None if the route of a file would have to be longer."""
     if candidate.pattern is not None:
         return route_of(candidate.pattern, area, plan.speed_mps, 60.0 * share * plan.minutes)
     full = flown(candidate.route.name, candidate.route.waypoints, plan.speed_mps)

@@ -336,7 +336,7 @@ def _best_model(
     place : str or Path
         The site.
     remarks : list of str
-        Receives a remark on the choice.
+        The function appends a remark about its choice.
 
     Returns
     -------

@@ -130,8 +130,8 @@ def typical_speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
 def _out_of_reach(time_s: FloatArray, place_m: FloatArray) -> Callable[[IntArray, IntArray], BoolArray]:
     """Return a function ``(first, second) -> mask`` of pairs of rows between which no aircraft can fly in the time.
 
-    The limits are the speed of the fastest aircraft, and the speed of this aircraft around these rows plus the gain
-    that its thrust allows.
+    Two speeds are the limits: that of the fastest aircraft, and that of this aircraft around these rows plus the
+    increase that its thrust allows.
 
     Parameters
     ----------

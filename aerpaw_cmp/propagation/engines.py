@@ -55,7 +55,7 @@ def path_cache(search: Search, run: Run) -> PathCache | None:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A number of rays per tower with its reason."""
+    """The chosen number of rays per tower, and the reason for the choice."""
 
     samples: int
     reason: str

@@ -121,7 +121,7 @@ class Channel:
         return [*self.along.remarks, *(f"Not modelled: {what}" for what in self.replay.left_out)]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
-        """Return values per path (paths, ...) as an array (paths per link, poses, towers, ...), and None for None."""
+        """Return values per path (paths, ...) as an array (paths per link, poses, towers, ...). None stays None."""
         return None if values is None else self.table.by_link(values, self.replay.ends, fill)
 
 

@@ -274,7 +274,7 @@ class LearnedSeries(StrictModel):
 
 
 class LearnedReceiver(StrictModel):
-    """A rank receiver of one tower, with kappa and log score on held-out flights and for a constant forecast.
+    """A rank receiver of one tower, with its scores on held-out flights and the log score of a constant forecast.
 
     Parameters
     ----------

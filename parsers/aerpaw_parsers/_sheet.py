@@ -599,7 +599,7 @@ def _split_places(sheet: Sheet) -> None:
 def of_readings(
     lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
 ) -> Sheet:
-    """Return a table of readings that are not separated columns. All other lines are comments unless they are rejected.
+    """Return a table of readings from a file without columns. All other lines are comments unless they are rejected.
 
     Parameters
     ----------

@@ -425,7 +425,7 @@ def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
 
 
 def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
-    """Check whether a column is the mean of another level, one of several means, or raw next to a calibrated level."""
+    """Check whether a column repeats a level in another form: a mean, or raw values of a calibrated level."""
     own = sheet.meanings[column]
     if own is None or not own.part:
         return _part(sheet, column) != ""

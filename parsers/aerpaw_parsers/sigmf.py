@@ -9,7 +9,7 @@ global field of the same name. A sounder has ``core:timestamp`` (epoch), ``core:
 Each frequency has a series. Header bytes (``core:header_bytes``) are not samples, and unsigned samples count from the
 middle of their range. Without values, levels are the power of each 20 ms of samples in the ``.sigmf-data`` of the same
 folder: 10 log10 of the mean of abs(x)^2 in dB re full scale of the data type. Clipped samples and a DC part are
-reported. The lines of the account are the values.
+reported. In the account of the file, each value counts as a line.
 """
 
 from __future__ import annotations

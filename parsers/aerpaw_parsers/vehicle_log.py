@@ -3,7 +3,7 @@
 AFAR's search script writes ``Filtered data (avg): Pwr:..,P_Var:.., Qual:..,Q_Var:.., {"lat": .., "lon": .., "alt":
 ..}, heading:..``: the position, level and quality averaged over a stop. Altitude is above take-off, heading in
 degrees clockwise from north. Waypoints, home and predictions are not positions of the aircraft and count as comments.
-The streams are the telemetry ``vehicle`` at the stops, and KPIs with the averages of the script.
+The streams are the telemetry ``vehicle`` at the stops, and KPIs with the averages that the script computed.
 """
 
 from __future__ import annotations

@@ -489,7 +489,7 @@ _SIGHTS, _SHADED_SHARE = 200, 0.01
 
 
 def _shaded(lines: Sequence[_Line], context: _Context) -> tuple[str, list[str]]:
-    """Return the keys of ``rt`` for links through woods or behind buildings, and comments with their share."""
+    """Return the keys of ``rt`` for links through woods or behind buildings, and comments with the share of links."""
     if context.finder is None:
         return "", []
     site, positions = context.finder.site, context.finder.positions_m(_SIGHTS)
@@ -1038,7 +1038,9 @@ _SURE_OF_VEHICLE = 0.1
 def _carrier(
     files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site
 ) -> tuple[tuple[Stream, Span] | None, str]:
-    """Choose the vehicle whose track fits the levels best at any tower. Also return a question if several flew.
+    """Choose the vehicle whose track fits the levels best at any tower.
+
+    Also return a question if several vehicles flew.
 
     Parameters
     ----------

@@ -274,7 +274,7 @@ class CrownIndex:
         return CrownIndex(stems, "cylinder")
 
     def _build_grid(self) -> None:
-        """List, per cell, the bodies within reach of any point of the cell (compressed rows)."""
+        """List, for each cell of a grid, the bodies that a ray through the cell may meet (as compressed rows)."""
         centre, widest = self._bodies[:, :2], float(self._bodies[:, 4].max())
         # pieces are looked up by their middle, so extend the reach by half a piece
         reach = widest + _PIECE_M / 2

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import platform
 import subprocess
 from datetime import datetime, timezone
 from functools import cache
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 
 from .. import __version__
@@ -79,3 +81,27 @@ def versions() -> dict[str, str]:
 def library_versions() -> dict[str, str]:
     """Return the versions of Python and the libraries."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+
+
+# Entry points of readers. The digest contains the versions of readers from other packages.
+READERS = "aerpaw_cmp.readers"
+
+# Code, and the tables that it reads: tables of the parsers, the dictionary of columns, and weights of the statistics.
+_SOURCES = ("**/*.py", "*.yaml", "logs/*.yaml", "compare/*.json")
+
+
+@cache
+def code_digest() -> str:
+    """Return the digest of this program's source and tables, and of the versions of its numerical packages."""
+    digest = hashlib.sha256()
+    for name in ("aerpaw_cmp", "aerpaw_parsers"):
+        with contextlib.suppress(ImportError):
+            root = Path(str(import_module(name).__file__)).parent
+            for path in sorted(path for pattern in _SOURCES for path in root.glob(pattern)):
+                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    for name in ("numpy", "scipy", "sionna-rt"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            digest.update(f"{name} {metadata.version(name)}".encode())
+    for plugin in sorted({str(p.dist and (p.dist.name, p.dist.version)) for p in metadata.entry_points(group=READERS)}):
+        digest.update(plugin.encode())
+    return digest.hexdigest()

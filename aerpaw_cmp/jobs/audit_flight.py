@@ -19,7 +19,7 @@ from ..common.files import cache_folder
 from ..common.stages import Progress, logged
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, spread_out
-from ..common.versions import library_versions, utc_now
+from ..common.versions import code_digest, library_versions, utc_now
 from ..compare.level import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
@@ -35,7 +35,7 @@ from ..propagation.options import Field, Search
 from ..propagation.replay import PER_LINK
 from ..propagation.search.sionna import free_memory
 from ..site.site import Site
-from .tasks import OutcomeStore, code_digest
+from .tasks import OutcomeStore
 
 # Number of logged attitudes that are converted to rotations a second time.
 _ATTITUDE_ROWS = 200

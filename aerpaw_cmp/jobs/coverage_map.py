@@ -24,6 +24,7 @@ from ..common.errors import InputError, UsageError, about_file, noting_interrupt
 from ..common.outputs import file_digest
 from ..common.stages import PlannedStage, Progress, Stages
 from ..common.text import counted
+from ..common.versions import code_digest
 from ..compare.rank import singular_values
 from ..flight.gains import p833_note
 from ..maps import evaluate as interpolation
@@ -46,7 +47,6 @@ from ..site.site import Site
 from ..site.siteyaml import coverage_of, inputs_of_site, load_site
 from .options import HIGHEST_M
 from .predict import CorrectedMaps
-from .tasks import code_digest
 from .workers import InProcess, Lost, Workers
 
 # Foliage modes, from no loss to total loss. The paper uses the last mode.

@@ -7,15 +7,13 @@ outcome is stored under a digest of its inputs, so no finished task is computed 
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import cache, lru_cache
-from importlib import import_module, metadata
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ from ..common.errors import AerpawCmpError, InputError, UsageError, parsing
 from ..common.files import LARGEST_TABLE, read_sealed, write_sealed
 from ..common.outputs import file_digest
 from ..common.units import AnyArray
+from ..common.versions import code_digest
 from ..common.yamlfile import input_files, named_files
 from ..flight.gains import load_with_learned
 from ..flight.settings import FlightFile
@@ -120,10 +119,6 @@ def _entry(name: str, place: Path, role: str) -> InputFile:
 LAYOUT = 8
 
 _SEAL = b"aerpaw-cmp outcome"
-
-
-# Entry points of readers. The digest contains the versions of readers from other packages.
-READERS = "aerpaw_cmp.readers"
 
 
 class OutcomeStore:
@@ -255,25 +250,4 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
     digest.update(settings.model_dump_json(exclude=_WITHOUT_EFFECT).encode())
     for entry in inputs:
         digest.update(f"{entry['role']} {entry['sha256']}\n".encode())
-    return digest.hexdigest()
-
-
-# Code, and the tables that it reads: tables of the parsers, the dictionary of columns, and weights of the statistics.
-_SOURCES = ("**/*.py", "*.yaml", "logs/*.yaml", "compare/*.json")
-
-
-@cache
-def code_digest() -> str:
-    """Return the digest of this program's source and tables, and of the versions of its numerical packages."""
-    digest = hashlib.sha256()
-    for name in ("aerpaw_cmp", "aerpaw_parsers"):
-        with contextlib.suppress(ImportError):
-            root = Path(str(import_module(name).__file__)).parent
-            for path in sorted(path for pattern in _SOURCES for path in root.glob(pattern)):
-                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    for name in ("numpy", "scipy", "sionna-rt"):
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            digest.update(f"{name} {metadata.version(name)}".encode())
-    for plugin in sorted({str(p.dist and (p.dist.name, p.dist.version)) for p in metadata.entry_points(group=READERS)}):
-        digest.update(plugin.encode())
     return digest.hexdigest()

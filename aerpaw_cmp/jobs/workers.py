@@ -35,7 +35,9 @@ from .. import __version__
 from ..common.errors import AerpawCmpError, InputError, UsageError
 from ..common.stages import Progress, logged
 from ..common.text import counted
-from .tasks import code_digest
+
+# not from a module that loads pandas and SciPy: each worker process imports this file before its task
+from ..common.versions import code_digest
 
 # A function of one item that can be pickled.
 Task = Callable[[Any], Any]

@@ -20,10 +20,11 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.files import seal
 from aerpaw_cmp.common.stages import logged
+from aerpaw_cmp.common.versions import code_digest
 from aerpaw_cmp.flight.settings import FlightFile, load_flight, overridden
 from aerpaw_cmp.jobs import campaign, sample
 from aerpaw_cmp.jobs.campaign import Outcome, Task, carry_out, compute, digest_of, kept_outcomes, planned_tasks
-from aerpaw_cmp.jobs.tasks import OutcomeStore, code_digest, task_inputs, task_key
+from aerpaw_cmp.jobs.tasks import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.workers import InProcess, Lost, Workers
 from aerpaw_cmp.report.campaign import Failure
 from tests.jobs.campaign_rows import rss_row

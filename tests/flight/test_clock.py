@@ -362,18 +362,32 @@ def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
     assert [c.name for c in flight_replay.clock_channels(data, series[1:])] == ["quality"]
 
 
-def test_a_telemetry_of_one_row_is_replayed_at_its_time(monkeypatch):
+def replayed_times(monkeypatch, start_s, end_s):
+    """Return the times [s] of the predictions for the clock of a flight."""
     replayed = []
     monkeypatch.setattr(
         flight_replay, "_along", lambda _data, _series, instants, _step: replayed.append(instants) or [ALONG]
     )
     monkeypatch.setattr(flight_replay, "_clock_levels", lambda *_: np.zeros(1))
     series = SimpleNamespace(tower="LW1", channel="one", unit="dBm", time=np.zeros(1, "M8[ns]"), settings_key="one")
-    data = SimpleNamespace(
-        track=SimpleNamespace(start_ns=5, end_ns=5), nodes={}, link_of=lambda _: SimpleNamespace(carrier_hz=3.3e9)
-    )
+    track = SimpleNamespace(start_ns=int(start_s * 1e9), end_ns=int(end_s * 1e9))
+    data = SimpleNamespace(track=track, nodes={}, link_of=lambda _: SimpleNamespace(carrier_hz=3.3e9))
     flight_replay.clock_channels(data, [series])
-    assert [list(instants.astype(int)) for instants in replayed] == [[5]]
+    (instants,) = replayed
+    return instants.astype(np.int64) * 1e-9
+
+
+def test_a_telemetry_of_one_row_is_replayed_at_its_time(monkeypatch):
+    assert list(replayed_times(monkeypatch, 5, 5)) == [5.0]
+
+
+def test_a_short_flight_is_replayed_finely_and_a_long_one_at_no_more_times_than_half_an_hour(monkeypatch):
+    """Lags are reported to 0.1 s. The processor time of a flight is that of its times."""
+    minute, half_hour, ten_hours = (replayed_times(monkeypatch, 0, end_s) for end_s in (60, 1800, 36_000))
+    assert 0.02 <= np.diff(minute).min() <= np.diff(minute).max() <= 0.1
+    assert len(half_hour) == pytest.approx(30 * len(minute), rel=0.01)
+    assert len(ten_hours) < 1.2 * len(half_hour)
+    assert ten_hours[-1] > 35_990
 
 
 def test_a_lag_is_excluded_only_where_no_model_explains_it():

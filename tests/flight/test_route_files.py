@@ -97,6 +97,14 @@ def test_heights_above_sea_level_of_a_map_count_from_its_first_point_and_say_so(
     assert any("sea level" in text and "130.0 m" in text for text in route.attrs["remarks"])
 
 
+@pytest.mark.parametrize(("home", "first"), [(HOME[:2], POINTS[0]), (HOME[:1], POINTS[1]), ((), POINTS[1])])
+def test_a_take_off_without_coordinates_is_at_home_if_the_plan_has_one(home, first, tmp_path: Path) -> None:
+    content = json.loads(FILES["here.plan"])
+    content["mission"]["plannedHomePosition"] = home
+    (tmp_path / "a.plan").write_text(json.dumps(content))
+    assert read_route(tmp_path / "a.plan").iloc[0, :3].tolist() == pytest.approx(first)
+
+
 REPORTED = Path(__file__).parents[1] / "reported"
 
 

@@ -14,6 +14,7 @@ from aerpaw_cmp.common.yamlfile import dump_yaml
 from aerpaw_cmp.compare.calibration import BASELINES, SPLITS, mean_rmse
 from aerpaw_cmp.compare.gains import NO_SPREAD
 from aerpaw_cmp.flight.settings import ArraySettings, FlightFile, LinkSettings, joined
+from aerpaw_cmp.jobs import calibrate as job
 from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights, recipe_of
 from aerpaw_cmp.jobs.calibration_files import learned_settings
 from aerpaw_cmp.jobs.options import RunOptions
@@ -229,3 +230,15 @@ def test_towers_with_one_channel_keep_their_own_antennas(tmp_path: Path) -> None
         "LW1": "LW1.snr.tower.csv", "LW2": "LW2.snr.tower.csv"
     }  # fmt: skip
     assert file(channels["A"].tower) == "LW1.A.tower.csv"
+
+
+def test_a_scored_flight_past_an_antenna_of_no_training_flight_is_a_remark(monkeypatch: pytest.MonkeyPatch) -> None:
+    def series(antenna: str) -> SimpleNamespace:
+        return SimpleNamespace(samples=SimpleNamespace(flight="new", antenna=antenna))
+
+    known, other = series("LW1"), series("LW2")
+    monkeypatch.setattr(job, "counted_once", lambda flights: (flights, []))
+    monkeypatch.setattr(job, "observe", lambda flights: (flights[0], []))
+    monkeypatch.setattr(job.calibration, "score_with", lambda _learned, scored, _observed: tuple(scored))
+    scores, remarks = job._score_further([[known, other]], [], None, [series("LW1")])
+    assert (scores, remarks) == ((known,), ["new: nothing was learned about LW2"])

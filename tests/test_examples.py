@@ -3,8 +3,10 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -28,7 +30,7 @@ def source_of(cell: dict[str, object]) -> str:
 
 def run_command(line: str) -> None:
     """Run a command in this process, because each start of Python would import all packages again."""
-    assert main(line.split()) == 0
+    assert main(shlex.split(line)) == 0
 
 
 def test_there_are_seven() -> None:
@@ -36,7 +38,9 @@ def test_there_are_seven() -> None:
 
 
 @pytest.mark.parametrize("path", [p for p in NOTEBOOKS if p != SIONNA], ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "a folder").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "a folder"))
     monkeypatch.chdir(FOLDER)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     scope: dict[str, object] = {"__name__": "notebook", "run_command": run_command}
@@ -45,14 +49,16 @@ def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.sionna
-def test_the_notebook_with_sionna_runs(sionna: object) -> None:
+def test_the_notebook_with_sionna_runs(sionna: object, tmp_path: Path) -> None:
     """Trace every twelfth pose. The cells run in another process, because scenes would stay in memory."""
     source = "\n".join(["from tests.test_examples import run_command", *map(source_of, cells(SIONNA))])
     thinned = source.replace("track = flight.track\n", "track = flight.track[::12]\n")
     assert thinned != source
     check = "assert len(card['levels']) == 5 and gain.shape[1] == 5 and (gain > 0).mean() > 0.95"
     lines = [sys.executable, "-c", f"{thinned}\n{check}"]
-    subprocess.run(lines, cwd=FOLDER, env={**os.environ, "MPLBACKEND": "Agg"}, check=True)
+    (tmp_path / "a folder").mkdir()
+    environment = {**os.environ, "MPLBACKEND": "Agg", "TMPDIR": str(tmp_path / "a folder")}
+    subprocess.run(lines, cwd=FOLDER, env=environment, check=True)
 
 
 def test_the_code_of_the_python_page_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

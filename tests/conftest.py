@@ -31,6 +31,9 @@ settings.load_profile("fixed" if os.environ.get("CI") else "further")
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+# While tests are collected, objects are only added: each worker would search them for a second.
+gc.disable()
+
 # nohup, and shells for jobs in the background, leave signals ignored, which every child of a test would inherit. What
 # ends a run from outside (timeout, a closed terminal) does so as Ctrl-C: pytest then takes its folders away.
 for _ending in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -165,6 +168,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
+    gc.enable()
 
 
 @pytest.hookimpl(wrapper=True)

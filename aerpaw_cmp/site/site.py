@@ -110,7 +110,8 @@ class Forest:
     filled: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
+# eq=False: equal only to itself, so that what is computed from it can be cached
+@dataclass(frozen=True, slots=True, eq=False)
 class Trees:
     """All single trees as columns, each of shape (trees,) [m].
 

@@ -120,7 +120,7 @@ def _forget() -> None:
     from aerpaw_cmp.propagation.field import foliage
 
     faces._faces.cache_clear()
-    foliage._last_indices.clear()
+    foliage.crown_index.cache_clear()
 
 
 def _target(fault: Fault) -> tuple[Any, Any, str, Any, str]:

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -228,16 +228,10 @@ def foliage_depth_m(
     return depth
 
 
-_last_indices: list[CrownIndex] = []
-
-
+@lru_cache(maxsize=2)
 def crown_index(trees: Trees) -> CrownIndex:
     """Return the spatial index of the cones of these trees. The last two are cached: a site has two kinds of ground."""
-    index = next((index for index in _last_indices if index.trees is trees), None)
-    if index is None:
-        index = CrownIndex(trees)
-        _last_indices[:] = [index, *_last_indices[:1]]
-    return index
+    return CrownIndex(trees)
 
 
 class CrownIndex:

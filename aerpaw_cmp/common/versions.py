@@ -100,8 +100,7 @@ def code_digest() -> str:
             for path in sorted(path for pattern in _SOURCES for path in root.glob(pattern)):
                 digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     for name in ("numpy", "scipy", "sionna-rt"):
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            digest.update(f"{name} {metadata.version(name)}".encode())
+        digest.update(f"{name} {version(name)}".encode())
     for plugin in sorted({str(p.dist and (p.dist.name, p.dist.version)) for p in metadata.entry_points(group=READERS)}):
         digest.update(plugin.encode())
     return digest.hexdigest()

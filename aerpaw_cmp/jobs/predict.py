@@ -269,7 +269,7 @@ def site_of(
     planned = None if where is None else flight_of(where)
     place: str | Path | None = named
     if place is None and where is not None and planned is None and (is_settings(where) or not where.exists()):
-        place = where if where.is_file() else str(where)
+        place = str(where)
     if place is not None:
         site = load_site(place)
     elif known:

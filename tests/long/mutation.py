@@ -1,13 +1,13 @@
-"""Mutation testing of the subpackages for physics, statistics and scoring.
+"""Mutation testing of the product.
 
 Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. The tests that
 reach the changed statement run in a forked child, where nothing else is changed, and end at the first failure. A mutant
 that passes every test has survived. `mutation_equivalent.txt` in the same folder lists the mutants that change nothing
-visible, each with its reason. Mutants are drawn at random over all modules of the subpackages, with a seed, because all
+visible, each with its reason. Mutants are drawn at random over all modules, with a seed, because all
 of them would take weeks.
 
     python -m tests.long.mutation record MAP [--tests tests/compare]   # which test reaches which line (some minutes)
-    python -m tests.long.mutation draw MAP --count 60 --seed 7 [--part 1/2] [--account FILE] [--only compare/ maps/]
+    python -m tests.long.mutation draw MAP --count 60 --seed 7 [--account FILE] [--only compare/ maps/]
 
 If hundreds of tests reach a line, the shortest case of each test runs first, then further cases, up to `--budget`
 seconds of processor time. A mutant that only a longer test would detect counts as survived, so the score is a lower
@@ -44,19 +44,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
-ROOMS = ("propagation", "compare", "flight", "maps")
-# Modules of the room `jobs` that decide what is scored, and on what.
-RULES = ("audit_flight", "calibrate", "campaign", "compare_flight", "flight_run", "likely_cause", "locate", "referee")
 
-TESTS = (
-    *(f"{base}/{room}" for base in ("tests", "aerpaw_cmp") for room in (*ROOMS, "jobs")),
-    "tests/site",
-    "tests/report/test_diff.py",
-    "tests/test_project.py::test_no_setting_is_without_effect",
-    "tests/test_round_trip.py",
-    "tests/test_equations.py",
-    "tests/test_public_face.py",
-)
 _GROWTH, _ALIKE = (f"tests/propagation/test_{name}.py::test_" for name in ("growth", "compiled"))
 _BEAMS = (
     *(f"{_GROWTH}a_mirror_is_seen_past_a_face_with_hollows[{name}]" for name in ("an L", "a frame")),
@@ -72,10 +60,7 @@ _BEAMS = (
     f"{_GROWTH}prisms_by_beams_have_the_paths_of_the_image_engine[True]",
 )  # fmt: skip
 # Lines of compiled code cannot be traced: these tests call it, and it is interpreted for each mutant.
-COMPILED = {
-    "aerpaw_cmp/propagation/search/beams.py": _BEAMS,
-    "aerpaw_cmp/propagation/search/merging.py": _BEAMS,
-}  # fmt: skip
+COMPILED = {f"aerpaw_cmp/propagation/search/{name}.py": _BEAMS for name in ("beams", "merging")}
 
 PRELOADED = (
     "numpy", "scipy.linalg", "scipy.signal", "scipy.spatial", "scipy.optimize", "scipy.stats", "pandas", "pytest",
@@ -563,11 +548,9 @@ def change_of(mutant: Mutant) -> str:
 
 
 def modules() -> list[str]:
-    """Return the files of the packages, and those files of `jobs` that decide what is scored."""
-    package = ROOT / "aerpaw_cmp"
-    files = [path for room in ROOMS for path in sorted((package / room).rglob("*.py"))]
-    files += [package / "jobs" / f"{name}.py" for name in RULES]
-    return [path.relative_to(ROOT).as_posix() for path in files if path.name != "__init__.py"]
+    """Return the files of the packages."""
+    files = [path for base in ("aerpaw_cmp", "parsers") for path in sorted((ROOT / base).rglob("*.py"))]
+    return [path.relative_to(ROOT).as_posix() for path in files if not path.name.startswith("__")]
 
 
 def record(target: Path, tests: tuple[str, ...]) -> None:
@@ -584,12 +567,10 @@ def record(target: Path, tests: tuple[str, ...]) -> None:
         print(f"fails without any change: {name}")
 
 
-def drawn(count: int, seed: int, only: list[str], part: str) -> list[Mutant]:
+def drawn(count: int, seed: int, only: list[str]) -> list[Mutant]:
     """Mutants at random over the modules, each mutant as likely as any other."""
     every = [mutant for path in modules() if any(some in path for some in only) for mutant in mutants(path)]
-    chosen = random.Random(seed).sample(every, min(count, len(every)))
-    number, parts = (int(text) for text in part.split("/"))
-    return chosen[number - 1 :: parts]
+    return random.Random(seed).sample(every, min(count, len(every)))
 
 
 def draw(chosen: list[Mutant], reach: Reach, account: Path | None, budget_s: float) -> None:
@@ -622,11 +603,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     of_map = commands.add_parser("record", help="which test reaches which line")
-    of_map.add_argument("--tests", nargs="+", default=TESTS)
+    of_map.add_argument("--tests", nargs="+", default=("tests",))
     of_draw = commands.add_parser("draw", help="try mutants")
     of_draw.add_argument("--count", type=int, default=60)
     of_draw.add_argument("--seed", type=int, default=1)
-    of_draw.add_argument("--part", default="1/1", help="one of several runs that share a draw")
     of_draw.add_argument("--only", nargs="+", default=["/"], help="modules whose path holds one of these")
     of_draw.add_argument("--budget", type=float, default=40.0, help="of tests for one mutant [s of the processor]")
     of_draw.add_argument("--account", type=Path, help="a line of JSON per mutant is added here")
@@ -646,7 +626,7 @@ def main() -> None:
         record(arguments.map, tuple(arguments.tests))
         return
     reach = json.loads(arguments.map.read_text(encoding="utf-8"))
-    chosen = drawn(arguments.count, arguments.seed, arguments.only, arguments.part)
+    chosen = drawn(arguments.count, arguments.seed, arguments.only)
     draw(chosen, reach, arguments.account, arguments.budget)
 
 

@@ -69,10 +69,9 @@ def test_random_command_lines_end_in_a_message_and_a_code() -> None:
 
 def test_the_files_and_tests_of_the_mutation_script_exist() -> None:
     lists = runpy.run_path(str(HERE / "mutation.py"))
-    for named in (*lists["TESTS"], *lists["_BEAMS"]):
+    for named in lists["_BEAMS"]:
         path, _, test = named.partition("::")
-        assert (ROOT / path).exists(), named
-        assert not test or f"def {test.partition('[')[0]}(" in (ROOT / path).read_text(), named
+        assert f"def {test.partition('[')[0]}(" in (ROOT / path).read_text(), named
     assert all((ROOT / path).is_file() for path in lists["modules"]())
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -922,3 +923,13 @@ def test_a_clock_at_the_end_of_the_searched_rates_has_no_name() -> None:
     sound = _sound(n=600)
     late = np.interp(0.95 * sound.time_s, sound.time_s, sound.predicted_db) + sound.measured_db - sound.predicted_db
     assert _named(replace(sound, measured_db=late, clock=_clock(6.1, "cannot tell"))) == NONE
+
+
+def test_a_step_is_rivalled_by_a_single_other_cause_that_explains_as_much() -> None:
+    channel = SimpleNamespace(error_db=np.full(100, 3.0), square=lambda error_db: float(error_db @ error_db))
+    explained = SimpleNamespace(trials=(), residual_db=np.zeros(100))
+
+    def rivalled(*names: str) -> bool:
+        return causes._rivalled(SimpleNamespace(chi2=900.0), [(channel, {frozenset(names): explained})])
+
+    assert [rivalled("heading"), rivalled("gain step"), rivalled("heading", "height")] == [True, False, False]

@@ -385,7 +385,6 @@ def test_a_short_flight_is_replayed_finely_and_a_long_one_at_no_more_times_than_
     """Lags are reported to 0.1 s. The processor time of a flight is that of its times."""
     minute, half_hour, ten_hours = (replayed_times(monkeypatch, 0, end_s) for end_s in (60, 1800, 36_000))
     assert 0.02 <= np.diff(minute).min() <= np.diff(minute).max() <= 0.1
-    assert len(half_hour) == pytest.approx(30 * len(minute), rel=0.01)
     assert len(ten_hours) < 1.2 * len(half_hour)
     assert ten_hours[-1] > 35_990
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from aerpaw_cmp.jobs.calibrate_rank import (
     features_of,
     read_receiver,
 )
+from aerpaw_cmp.jobs.compare_flight import fitted_receiver
 from aerpaw_cmp.propagation import drivers
 from aerpaw_cmp.propagation.geometry import (
     Link,
@@ -75,7 +77,10 @@ def test_a_receiver_survives_its_file(tried: Tried, tmp_path: Path) -> None:
     fitted = tried.fit([0, 1])
     path = tmp_path / "receiver.json"
     path.write_text(RankCalibration(receivers={"T": fitted}, scores={}, warnings=()).text(), encoding="utf-8")
-    again = read_receiver(path)["T"]
+    data = SimpleNamespace(folder=tmp_path, settings=SimpleNamespace(rank=SimpleNamespace(receiver="receiver.json")))
+    with pytest.raises(InputError, match="no receiver at U"):
+        fitted_receiver(data, "U")
+    again = fitted_receiver(data, "T")
     assert again.geometries == fitted.geometries
     assert again.flights == ("f1", "f2")
     np.testing.assert_array_equal(again.forecast(tried.samples[0])[0], fitted.forecast(tried.samples[0])[0])

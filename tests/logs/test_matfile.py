@@ -41,9 +41,10 @@ def test_numeric_arrays_come_back(array: np.ndarray, compressed: bool) -> None:
 @pytest.mark.parametrize("compressed", [False, True])
 def test_text_and_what_is_left_out(compressed: bool) -> None:
     rows = np.array(["2024-07-15 11:48:16.776", "2024-07-15 11:48:17.1  "])
-    data = saved(compressed, clock=rows, pair={"a": 1.0}, cells=np.array([[1, "x"]], dtype=object), z=np.array([[1j]]))
-    arrays = read_arrays(data, None)
-    assert set(arrays) == {"clock", "z"}, "structures and cells are left out"
+    left_out = {"pair": {"a": 1.0}, "cells": np.array([[1, "x"]], dtype=object)}
+    arrays = read_arrays(saved(compressed, clock=rows, column=rows[:, None], z=np.array([[1j]]), **left_out), None)
+    assert set(arrays) == {"clock", "column", "z"}, "structures and cells are left out"
+    assert arrays["column"].tolist() == arrays["clock"].tolist()
     assert arrays["z"].tolist() == [[1j]]
     assert arrays["clock"].tolist() == ["2024-07-15 11:48:16.776", "2024-07-15 11:48:17.1"]
 

@@ -10,7 +10,6 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.commands.reports import _print_campaign_summary
 from aerpaw_cmp.jobs import bench
-from aerpaw_cmp.propagation import llvm
 from tests.geojson import collection, feature, polygon
 
 ROOT = Path(__file__).parents[1]
@@ -50,19 +49,6 @@ def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
     logs = [r for r in listed if r["kinds"]]  # the others name files that are not logs
     assert all(r["sample"] for r in logs)
     assert len(logs) >= 29
-
-
-def test_doctor_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The result of this machine's LLVM trial is cached. tests/propagation/test_llvm.py repeats the trial."""
-    trials = list(llvm._trials())
-    monkeypatch.setattr(llvm, "first_that_works", lambda _: trials)
-    capsys.readouterr()
-    code = main(["doctor", "--json"])
-    checks = json.loads(capsys.readouterr().out)["checks"]
-    failed = [c for c in checks if c["status"] == "fail"]
-    assert code == (1 if failed else 0)
-    assert all(c["remedy"] for c in failed)
-    assert {"Python", "LLVM", "Readers"} <= {c["name"] for c in checks}
 
 
 def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

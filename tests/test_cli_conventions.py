@@ -93,8 +93,9 @@ def test_the_page_lists_what_json_prints(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    main([*QUICK[name].split(), "--json"])
+    code = main([*QUICK[name].split(), "--json"])
     printed = json.loads(capsys.readouterr().out)
+    assert code == any(check["status"] == "fail" for check in printed.get("checks", ()))
     assert ["schema", *listed(name)] == list(printed)
     assert f"`schema` is {printed['schema']}" in PAGE
 

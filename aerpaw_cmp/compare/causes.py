@@ -434,8 +434,7 @@ def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
     for evidence in filter(None, map(in_bins, channels)):
         sound, (antenna,) = _fitted(evidence), _pattern(evidence)
         learned = _fitted(evidence, antenna, at=sound.parameters)
-        left_db = float(learned.residual_db.std())
-        fall_db = min(float(sound.residual_db.std()), float(evidence.measured_db.std())) - left_db
+        fall_db = float(min(sound.residual_db.std(), evidence.measured_db.std()) - learned.residual_db.std())
         if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= SHOWN_DB:
             return True
     return False
@@ -770,16 +769,9 @@ def _growing(e: LevelEvidence) -> FloatArray:
 
 def _misread(e: LevelEvidence) -> Iterator[Trial]:
     """Yield trials in which the telemetry has other units, signs or columns than its reader assumed."""
-    # a factor cannot explain heights that jump
-    jumps = (np.abs(np.diff(e.place_m[:, 2])) > _JUMP_M + _FASTEST_MPS * np.diff(e.time_s)).any()
-    step = "check the telemetry's columns and units"
-    for meaning, change in {**e.misread_db, **({} if jumps else e.scaled_db)}.items():
-        cost = math.log(len(e.misread_db) + len(e.scaled_db))
+    step, cost = "check the telemetry's columns and units", math.log(max(len(e.misread_db), 1))
+    for meaning, change in e.misread_db.items():
         yield Trial(name="telemetry", cost=cost, sentence=meaning, next_step=step, change_db=change)
-
-
-# A UAV climbs with at most 6 m/s, which are 20 m/s if feet are read as metres.
-_JUMP_M, _FASTEST_MPS = 5.0, 25.0
 
 
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
@@ -888,21 +880,23 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     """
     up = np.sin(np.radians(e.uav_elevation_deg))
     elevation = _GAIN_DB * np.column_stack([up, up**2, up**3])
-    rivals = [_SLOPE * e.predicted_db[:, None], elevation]
-    rivals += [] if e.distance_db is None else [_SLOPE * e.distance_db[:, None]]
+    rivals = [elevation] if e.distance_db is None else [elevation, _SLOPE * e.distance_db[:, None]]
+    # an amplifier compresses the levels above a knee; expanded levels have another reason
+    above = [np.maximum(e.predicted_db - knee_db, 0.0)[:, None] for knee_db in np.quantile(e.predicted_db, _KNEES)]
+    bent = [of for of in above if (e.measured_db - e.predicted_db) @ (of - of.mean()) < 0.0]
+    slopes = [Trial(columns=_SLOPE * of) for of in (e.predicted_db[:, None], *bent)]
     others = [Trial(columns=columns) for columns in rivals]
     # a prediction without antennas is free space: doubled decibels then equal a path-loss exponent of 4
     alike = e.distance_db is not None and bool((e.predicted_db - e.distance_db).std() < SHOWN_DB)
     if alike:
         # near its maximum, the log likelihood is a parabola
-        best, sd = _slope(e, np.polyfit(e.predicted_db, e.measured_db, 1)[0], 0.1, _fitted(e, others[0]).parameters)
+        best, sd = _slope(e, np.polyfit(e.predicted_db, e.measured_db, 1)[0], 0.1, _fitted(e, slopes[0]).parameters)
         if best >= _STEEP:
             # obstacles near the ground cause such an exponent; in the air it is unlikely
             doubled = abs(best - 2.0) <= 1.96 * sd and np.nanmedian(e.place_m[:, 2]) > _NEAR_GROUND_M
-            words = ", or decibels are doubled" if doubled else ""
             yield Trial(
-                name="exponent or decibels", cost=math.log(2.0), columns=rivals[0],
-                sentence=f"the path-loss exponent is {2.0 * best:.1f}{words}",
+                name="exponent or decibels", cost=math.log(2.0), columns=slopes[0].columns,
+                sentence=f"the path-loss exponent is {2.0 * best:.1f}{', or decibels are doubled' if doubled else ''}",
                 next_step="check the unit of the levels" if doubled else "add missing obstacles to the site",
                 estimate=(2.0 * best, 2.0 * best - 3.92 * sd, 2.0 * best + 3.92 * sd),
             )  # fmt: skip
@@ -913,14 +907,19 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
         if not _nearer(e, factor * e.predicted_db) or (alike and factor == 2.0):
             continue
         fit = _fitted(e, trial)
-        slope, *apart = (_fitted(e, other, at=fit.parameters).log_likelihood for other in others)
+        fits = ((_fitted(e, other, at=fit.parameters) for other in of) for of in (slopes, others))
+        slope, apart = (max(other.log_likelihood for other in of) for of in fits)
         # above a floor, logged levels change by fewer decibels than the link
-        least = -math.inf if e.floored else max(apart) + _RARE
+        least = -math.inf if e.floored else apart + _RARE
         if _is_slope(e, factor, fit.parameters) and fit.log_likelihood > max(least, slope):
             yield trial
             return
     # alternatives without a name: a cause must be likelier than another slope or exponent
-    yield from (others[0], *others[2:])
+    yield from (*slopes, *others[1:])
+
+
+# Shares of the levels below the knee of an amplifier.
+_KNEES = (0.3, 0.5, 0.7)
 
 
 # Cause, sentence and next step for each slope of measured over predicted levels. Prior standard deviation of a slope.
@@ -1107,7 +1106,7 @@ _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 _EDGE_DEG = 4.0
 # Smallest loss behind an obstacle [dB]. A smaller loss in a sector is usually caused by an antenna.
 _LEAST_LOSS_DB = 6.0
-_MOSTSTARTS = 600
+_MOST_STARTS = 600
 
 
 def _blocked(e: LevelEvidence) -> Iterator[Trial]:
@@ -1156,10 +1155,9 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     if not len(starts):
         return
     # limit the number of tried starts, because neighbouring bins have nearly the same step
-    starts = starts[:: 1 + len(starts) // _MOSTSTARTS]
+    starts = starts[:: 1 + len(starts) // _MOST_STARTS]
     # a gain that drifts is an alternative to a step
-    creep = _STEP_DB * (np.arange(n) / n)[:, None]
-    yield Trial(columns=creep)
+    yield Trial(columns=_STEP_DB * (np.arange(n) / n)[:, None])
     # the channels of a tower step at the same time
     channels = (e, *e.others)
     masks = [(_seconds(c, e)[None, :] >= e.time_s[starts][:, None]).astype(np.float64) for c in channels]

@@ -55,7 +55,7 @@ class LevelEvidence:
         for antennas without a pattern.
     attitude_db : mapping of str to (n,)
         Change of the predicted level with other values of ``rt.attitude``.
-    misread_db, scaled_db : mapping of str to (n,)
+    misread_db : mapping of str to (n,)
         Change of the predicted level if the telemetry has another meaning, or its heights have another unit, by that
         meaning in words.
     other_towers_db : mapping of str to (n,)
@@ -103,7 +103,6 @@ class LevelEvidence:
     raised_db: Mapping[float, FloatArray] = field(default_factory=dict)
     attitude_db: Mapping[str, FloatArray] = field(default_factory=dict)
     misread_db: Mapping[str, FloatArray] = field(default_factory=dict)
-    scaled_db: Mapping[str, FloatArray] = field(default_factory=dict)
     other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
     towers: frozenset[str] = frozenset()
     locked: FloatArray | None = None

@@ -173,10 +173,15 @@ SIMULATED = Cause(
 def heights_meant(telemetry: Stream) -> str | None:
     """Return a clause about the unit of logged heights if their changes do not fit the logged vertical speed.
 
-    The text is empty if the changes fit. Return None if the speeds do not determine the unit.
+    The text is empty if the changes fit, and if a height jumps, which no unit explains. Return None if the speeds do
+    not determine the unit.
     """
     rows, time_s, place_m = path_of(telemetry.frame)
     speed_mps = telemetry.frame[list(_SPEED)].to_numpy(np.float64)[rows] * [1.0, 1.0, -1.0]
+    # skip rows that repeat a position
+    moved = (np.diff(place_m, axis=0, prepend=math.nan) != 0.0).any(axis=1)
+    if (np.abs(np.diff(place_m[moved, 2])) > _JUMP_M + _FASTEST_MPS * np.abs(np.diff(time_s[moved]))).any():
+        return ""
     step_s, flown = np.diff(time_s)[:, None], np.diff(place_m, axis=0)
     expected = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * step_s
     near = np.isfinite(expected).all(axis=1) & (step_s[:, 0] > 0.0) & (step_s[:, 0] < _LONG_STEP_S)
@@ -198,6 +203,8 @@ _HEIGHTS = {"the logged heights are in feet": FOOT_M, "the logged heights were d
 # In four field logs, heights change by 0.90 to 1.00 of the logged speed. Time steps longer than the third number [s]
 # are not used, because the path within them is unknown.
 _SAME_RATIO, _LEAST_FIT, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
+# A UAV climbs with at most 6 m/s, which are 20 m/s if feet are read as metres.
+_JUMP_M, _FASTEST_MPS = 5.0, 25.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 
@@ -233,6 +240,7 @@ def _evidence(
     thin = dataclasses.replace(replayed, poses=replayed.poses[some], track=track)
     link = _Direct(data.site, series.tower, thin, rotations)
     known_db, known_both_db = link.level(), link.level(tower=True)
+    times = telemetry_time(series.time, replayed.clock)[replayed.valid][some]
     time_s = rss.seconds(series.time)
     order = np.argsort(time_s, kind="stable")
 
@@ -276,10 +284,7 @@ def _evidence(
         turned_db=changed(link.turned_db()),
         raised_db=changed(link.raised_db(), known_both_db),
         attitude_db=changed(link.attitude_db(data.settings.rss_attitude)),
-        misread_db=changed(
-            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid][some]), known_both_db
-        ),
-        scaled_db=changed(link.scaled_db(data) if scaled else {}, known_both_db),
+        misread_db=changed(link.misread_db(data, times, scaled), known_both_db),
         other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
         towers=frozenset(other.tower for other in data.rss if other.channel == series.channel),
         locked=None if series.locked is None else series.locked[order],
@@ -372,19 +377,11 @@ class _Direct:
         changes = level_db.reshape(len(keys), -1) - known_db[at]
         return {key: known_db + np.interp(np.arange(n), at, change) for key, change in zip(keys, changes, strict=True)}
 
-    def scaled_db(self, data: FlightData) -> dict[str, FloatArray]:
-        """Return levels with the logged heights in another unit."""
-        position_m = self.replayed.poses.position_m
-        if data.track is None or self.replayed.track is None:
-            return {}
-        ground_m = np.array([0.0, 0.0, data.track.ground_m])
-        return {
-            meaning: self.level(position_m=ground_m + (position_m - ground_m) * [1.0, 1.0, scale], tower=True)
-            for meaning, scale in _HEIGHTS.items()
-        }
+    def misread_db(self, data: FlightData, time: Times, scaled: bool) -> dict[str, FloatArray]:
+        """Return levels with another meaning of the telemetry, at the times of the poses (m,).
 
-    def misread_db(self, data: FlightData, time: Times) -> dict[str, FloatArray]:
-        """Return levels with another meaning of the telemetry, other than units, at the times of the poses (m,)."""
+        ``scaled`` adds heights in another unit.
+        """
         position_m, track, used = self.replayed.poses.position_m, self.replayed.track, data.settings.rss_attitude
         if data.track is None or track is None:
             return {}
@@ -402,6 +399,9 @@ class _Direct:
                     self.rotations[key] = data.track.rotations_if(meaning, time)
                 rotation = attitude_rotation(dataclasses.replace(track, rotation=self.rotations[key]), used)
                 levels[meaning] = self.level(rotation=rotation, tower=True)
+        for meaning, scale in _HEIGHTS.items() if scaled else ():
+            ground_m = np.array([0.0, 0.0, data.track.ground_m])
+            levels[meaning] = self.level(position_m=ground_m + (position_m - ground_m) * [1.0, 1.0, scale], tower=True)
         return levels
 
     def other_towers_db(self) -> dict[str, FloatArray]:

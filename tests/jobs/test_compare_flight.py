@@ -552,7 +552,7 @@ def test_a_mirrored_track_without_attitude_mirrors_its_course(monkeypatch: pytes
     )
     monkeypatch.setattr(likely_cause._Direct, "level", lambda _, **at: at)
     link = likely_cause._Direct(site=None, tower="LW1", replayed=replayed, rotations={})  # type: ignore[arg-type]
-    ((meaning, at),) = link.misread_db(data, np.zeros(3, dtype="datetime64[ns]")).items()
+    ((meaning, at),) = link.misread_db(data, np.zeros(3, dtype="datetime64[ns]"), False).items()
     assert meaning == "east and north of the track are swapped"
     np.testing.assert_allclose(at["position_m"], [[1.0, 2.0, 40.0], [1.0, 10.0, 40.0], [4.0, 10.0, 40.0]])
     mirrored = rotation_from_aircraft(0.0 * heading, 0.0 * heading, 90.0 - heading)

@@ -305,6 +305,11 @@ def ground_nodes(
             nodes |= {} if track is None else {name: track}
             if warnings is not None:
                 warnings += [f"towers.{name}: {text}" for text in remarks]
+        if node.region90_m is not None and warnings is not None:
+            warnings.append(
+                f"towers.{name}: the position was estimated from levels (90 % region: {node.region90_m:.0f} m), so a "
+                "part of the error can be an error of this position: enter the measured position without region90_m"
+            )
         east, north = site.frame.to_local(np.array([latitude]), np.array([longitude]))
         towers[name] = Tower(
             name=name,

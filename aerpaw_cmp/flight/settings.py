@@ -385,6 +385,8 @@ class GroundNode(StrictModel):
         position.
     height : {"ground", "logged"}
         ``ground``: the antenna is ``antenna_height_m`` above the ground. ``logged``: at the height of the track.
+    region90_m : float, optional
+        Radius of the 90 % region of a position that was estimated from levels [m]. Remove it for a measured position.
     """
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
@@ -392,6 +394,7 @@ class GroundNode(StrictModel):
     track: LogSettings | None = None
     height: Literal["ground", "logged"] = "ground"
     antenna_height_m: Positive = 1.5
+    region90_m: Positive | None = None
 
     @field_validator("track", mode="before")
     @classmethod

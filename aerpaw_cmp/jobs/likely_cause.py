@@ -80,6 +80,9 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     # errors that depend on direction are expected if a named antenna could not be used; a caution contains the reason
     if any(not c.used for c in data.settings.cautions) and by_direction:
         return None, "see the first caution: a learned antenna that the flight file names is not used"
+    estimated = [name for name, node in data.settings.towers.items() if node.region90_m is not None]
+    if estimated and by_direction:
+        return None, f"enter the measured position of {' and '.join(estimated)} in `towers:`"
     # learned antennas, of the flight file or of `report --with`, have an error of some decibels on each flight
     if cause is not None or any(e.antenna == "learned" for e in evidence) or not gains_by_direction(evidence):
         return cause, None

@@ -11,6 +11,7 @@ import pytest
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.compare.locate import LevelModel, LevelTrack, NodeEstimate, Regions, known_cases, level_track
+from aerpaw_cmp.flight.data import ground_nodes
 from aerpaw_cmp.flight.drafting import proposals as node
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.drafting.proposals import listed_places
@@ -102,6 +103,8 @@ def test_levels_of_no_tower_are_placed_and_asked_about(tmp_path: Path) -> None:
     assert np.hypot(east[0] - ROVER[0], north[0] - ROVER[1]) < 25.0
     assert "no tower fits the levels" in remarks  # LW1 is outside the region
     assert "where was the node?" in remarks
+    ground_nodes(SITE, settings, tmp_path, warnings := list[str]())
+    assert [f"(90 % region: {node.region90_m:.0f} m)" in text for text in warnings] == [True]
 
 
 def test_a_position_list_is_tried_first(tmp_path: Path) -> None:
@@ -184,7 +187,7 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
     assert finder.propose(level_track(4.0 * np.arange(19), np.zeros((19, 3)), np.zeros(19))) is None
     if isinstance(said, int):
         assert proposal.tower is not None
-        assert (proposal.node, proposal.tower["antenna_height_m"], proposal.radius_m) == ("NODE", 1.5, 0.0)
+        assert (proposal.node, proposal.tower["antenna_height_m"], len(proposal.tower)) == ("NODE", 1.5, 3)
         assert f"line {said}" in proposal.question
         assert (f"line {15 - said}" in proposal.question) == (max(listed) - min(listed) < 3.0)
         np.testing.assert_allclose(asked[0][-2:], [[-100.0, 50.0, 1.5], [250.0, -90.0, 1.5]], atol=1e-3)
@@ -194,7 +197,7 @@ def test_a_tower_stands_unless_a_place_wins_and_a_listed_one_wants_as_much_as_an
         assert (east[0], north[0]) == pytest.approx(tuple(at[:2]), abs=0.02)
         near = [n for n, t in SITE.towers.items() if np.hypot(*(np.array(t.position_m) - at)[:2]) <= 77.0]
         assert (f"({', '.join(near)} possible)" if near else "no tower fits") in proposal.question
-        assert (proposal.radius_m, proposal.tower["antenna_height_m"]) == (77.0, 10.0)
+        assert (proposal.tower["region90_m"], proposal.tower["antenna_height_m"]) == (77, 10.0)
         assert proposal.position_m is not None
         again = finder.propose(track, nodes={proposal.node: proposal.position_m})
         assert again is not None

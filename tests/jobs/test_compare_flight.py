@@ -37,7 +37,8 @@ pytestmark = pytest.mark.usefixtures("blank_pictures")
 def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sentence, warning and table name the same clock.
 
-    There is no question if the clock was corrected or if it changes nothing.
+    There is no question if the clock was corrected or if it changes nothing. Directions from an estimated position are
+    no cause.
     """
     monkeypatch.setattr(likely_cause, "gains_by_direction", lambda *_: None)
     for shifted, other, fall_db, first in (
@@ -58,7 +59,7 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
         monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _, fall_db=fall_db: fall_db)
         monkeypatch.setattr(likely_cause, "_evidence", lambda _, s, *__, of=of, **___: of[s.tower])
-        settings = SimpleNamespace(antennas={}, cautions=())
+        settings = SimpleNamespace(antennas={}, cautions=(), towers={"LW2": SimpleNamespace(region90_m=90.0)})
         data: Any = SimpleNamespace(files=[], rss=[SimpleNamespace(tower=name) for name in of], settings=settings)
         replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None)] * 2)
         score = SimpleNamespace(rmse_db=0.9 if first is None else 2.0, n=9)
@@ -66,7 +67,10 @@ def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: p
             SimpleNamespace(name=f"{name} A", measured_db=np.arange(9.0) * i, training=False, score=score)
             for i, name in enumerate(("LW1", "LW2"), 1)
         ]
-        cause, _ = likely_cause.cause_of(data, replays, results)
+        cause, step = likely_cause.cause_of(data, replays, results)
+        assert step == (
+            "enter the measured position of LW2 in `towers:`" if first is False and other != "lock" else None
+        )
         said = "The radio clock at LW1 is 0.40 s ahead; those at LW2 are right."
         assert (cause is not None and (cause.sentence, cause.next_step) == (said, "`rss: {lag: apply}`")) == bool(first)
 

@@ -392,7 +392,8 @@ def _learned_antennas(lines: Sequence[_Line], context: _Context, data: FlightDat
     if data is None:
         return Proposal(), []
     site = context.options.site
-    placed = [p.node for line in lines for p in line.places if p.tower is not None and p.radius_m <= _SURE_M]
+    towers = {p.node: p.tower for line in lines for p in line.places if p.tower is not None}
+    placed = [name for name, tower in towers.items() if tower.get("region90_m", 0.0) <= _SURE_M]
     nodes = Nodes(placed=frozenset(placed), fixed=() if context.finder is None else context.towers)
     try:
         return propose(data, site_place(site, context.folder), str(Path(site).with_suffix("")), nodes), []

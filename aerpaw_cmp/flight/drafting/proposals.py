@@ -129,8 +129,6 @@ class Placement:
         earlier log.
     question : str
         Question about the proposal.
-    radius_m : float
-        Radius of the 90 % region of an estimated position, or 0 for a known position [m].
     position_m : (3,), optional
         East, north and up of a node that is not in the site [m]. None if it was proposed for an earlier log.
     """
@@ -138,7 +136,6 @@ class Placement:
     node: str
     tower: Mapping[str, Any] | None
     question: str
-    radius_m: float = 0.0
     position_m: FloatArray | None = None
 
 
@@ -288,8 +285,8 @@ class NodeFinder:
             f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where was the node?"
         )
         place = estimate.place_m
-        at_estimate = round(float(latitude[0]), 7), round(float(longitude[0]), 7), float(place[2])
-        return replace(_node(place, at_estimate, about, nodes), radius_m=estimate.radius90_m)
+        degrees = round(float(latitude[0]), 7), round(float(longitude[0]), 7)
+        return _node(place, (*degrees, float(place[2]), math.ceil(estimate.radius90_m)), about, nodes)
 
     def _supports(self, track: LevelTrack, tower: str, known: LearnedTower) -> bool:
         """Check whether levels support the learned antennas of a tower against an unknown gain."""
@@ -358,14 +355,15 @@ class NodeFinder:
 _SAME_NODE_M = 100.0
 
 
-def _node(
-    position_m: FloatArray, at: tuple[float, float, float], question: str, nodes: Mapping[str, FloatArray]
-) -> Placement:
-    """Return the placement at a position (latitude, longitude [deg], height [m]): a new node, or one of ``nodes``."""
+def _node(position_m: FloatArray, at: tuple[float, ...], question: str, nodes: Mapping[str, FloatArray]) -> Placement:
+    """Return the placement at a position: a new node, or one of ``nodes``.
+
+    ``at`` are latitude and longitude [deg], height [m] and, for an estimated position, its 90 % region [m].
+    """
     for name, placed in nodes.items():
         if np.hypot(*(placed[:2] - position_m[:2])) < _SAME_NODE_M:
             return Placement(name, None, "")
-    tower = dict(zip(("latitude_deg", "longitude_deg", "antenna_height_m"), at, strict=True))
+    tower = dict(zip(("latitude_deg", "longitude_deg", "antenna_height_m", "region90_m"), at, strict=False))
     name = "NODE" + (str(len(nodes) + 1) if nodes else "")
     return Placement(name, tower, question, position_m=position_m)
 

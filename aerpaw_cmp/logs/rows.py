@@ -292,7 +292,7 @@ def built(
     instants.flag(flag)
     if lines.unterminated and not others.closed:
         _text.add_flag(flag, rows == len(lines) - 1, _text.UNTERMINATED)
-    warnings = [*instants.warnings, *[RELATIVE] * bool(relative and len(rows))]
+    warnings = [*instants.warnings, *([RELATIVE] if relative and len(rows) else [])]
     at, time = np.flatnonzero(~comment), instants.time
     column = {name: cells for name, cells in column.items() if name != "time"}
     if not valid.all():

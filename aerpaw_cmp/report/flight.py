@@ -625,7 +625,8 @@ def write_report(
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     files = ["metrics.json", *(path.name for path in written if path.parent == folder)]
     # the page lists the folder of figures only if there are any
-    files += ["figures/"] * bool(pictures)
+    if pictures:
+        files.append("figures/")
     with stages("report"):
         html = write_file(folder / "report.html", page(data, files))
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))

@@ -59,7 +59,7 @@ def write_locate(
         kind="locate", title=f"Ground node of {numbers['flight']}, {numbers['channel']}", verdict=numbers["sentence"],
         cautions=numbers["warnings"], about=[f"Made {minute(numbers['generated'])}."],
         cards=[Card(title="Map", positions=Positions(view="places", data=shown)),
-               *[Card(title="Regions", id="places", tables=[table])] * (len(numbers["modes"]) > 1),
+               *([Card(title="Regions", id="places", tables=[table])] if len(numbers["modes"]) > 1 else []),
                Card(title="Assumptions", id="assumed", text=[numbers["assumed"]])],
     )  # fmt: skip
     latitude, longitude = site.frame.to_geographic(east, north)

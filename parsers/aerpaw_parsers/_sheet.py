@@ -447,10 +447,10 @@ class Sheet:
         out = [text for i, text in sorted(self.notes.items()) if i not in idle]
         if left:
             out.append(f"not read, though they look like levels, identities, positions, times or flags: {shown}{more}")
-        words = [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]
-        shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
-        text = "If one names the cell or device of a row, call it 'cell' or 'device' (or --map NAME=cell)"
-        out += [f"not read: {shown}. {text}"] * bool(words)
+        if words := [i for i in range(len(self.names)) if i not in {*self.used, *left} and self._may_name(i)]:
+            shown = ", ".join(repr(self.names[i]) for i in words[:_MOST_NAMED])
+            text = "If one names the cell or device of a row, call it 'cell' or 'device' (or --map NAME=cell)"
+            out.append(f"not read: {shown}. {text}")
         gains = [i for i in left if dictionary.has("gain", self.plain[i]) and np.nanstd(self.numbers(i)) > 0]
         text = "changes, and levels are not corrected for it: do they already include it?"
         out += [f"column {self.names[i]!r} {text}" for i in gains[:1]]
@@ -462,9 +462,9 @@ class Sheet:
             for number, text in beside.items()
             if dictionary.has("of_values", text) and not text.startswith(self.names[0] or "?")
         ]
-        equal = len(self) - len({*map(tuple, self.cells)})
-        text = f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?"
-        return out + [text] * (equal > _MOST_EQUAL * len(self))
+        if (equal := len(self) - len({*map(tuple, self.cells)})) > _MOST_EQUAL * len(self):
+            out.append(f"{counted(equal, 'row')} equal to another row in every cell: was one log joined twice?")
+        return out
 
     def _is_of_interest(self, column: int) -> bool:
         """Check whether a column has values and looks like a level, an identity, a position or a time."""

@@ -73,7 +73,7 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """A specification of what to learn.
+    """The inputs of :func:`learn` in addition to the samples: a gain model and measured patterns.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Mounted:
-    """The measured patterns by name, and the fitted mounts of the patterns that a flight used."""
+    """The measured patterns by name, and the fitted mounts of the patterns that the flights used."""
 
     patterns: Mapping[str, gains.GainOf]
     mounts: Mapping[str, gains.MountFit]
@@ -142,7 +142,7 @@ class Learned(Mounted):
         return self.patterns_db(samples) + gain, sd
 
     def mean_error(self, samples: LinkSamples) -> float:
-        """Return the mean of measured level minus :meth:`mean` [dB], NaN if no sample has both."""
+        """Return the mean of measured level minus :meth:`mean` [dB], NaN if no sample has a level and a prediction."""
         error = samples.residual_db - self.mean(samples)
         return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
 
@@ -151,7 +151,7 @@ class Learned(Mounted):
         return self.patterns_db(samples) + _mean_along(self.fit, samples)
 
 
-# Averaging time [s]. A UAV hardly turns within it.
+# Averaging time [s]. A UAV hardly turns within this time.
 _FINE_S = 0.5
 
 
@@ -166,7 +166,7 @@ def _mean_along(fit: gains.GainFit, samples: LinkSamples) -> FloatArray:
 
 
 def learn(series: Sequence[LinkSamples], recipe: Recipe, model: gains.GainModel | None = None) -> Learned:
-    """Fit the mounts of the measured patterns, then a gain over direction to what they do not explain.
+    """Fit the mounts of the measured patterns, then a gain over direction to the residual that remains.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: gains.GainModel 
     mounted = Mounted(recipe.patterns, gains.fit_mounts(series, patterns) if patterns else {})
     residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
     fit = gains.chosen_fit(residuals, recipe.model) if model is None else gains.fit_gain(residuals, model)
-    if any(s.floor_db is not None for s in series):  # a third fit does not change held-out errors
+    if any(s.floor_db is not None for s in series):  # fit again once: a third fit does not change held-out errors
         fit = gains.fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: gains.fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
@@ -189,7 +189,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: gains.GainModel 
 
 
 def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: gains.GainFit) -> LinkSamples:
-    """Subtract ``known_db`` from the residual, and replace samples below the floor.
+    """Return the samples with ``known_db`` subtracted from the residual, and with samples below the floor replaced.
 
     Samples below the floor get the value that the fit predicts, limited to the floor.
     """
@@ -306,7 +306,7 @@ def mean_rmse(scores: Sequence[Score], name: str = "rmse_db") -> float:
 
 
 def flights_of(observed: Sequence[Observed]) -> list[str]:
-    """Return the names of the flights in order."""
+    """Return the names of the flights, each once, in the order of their samples."""
     return list(dict.fromkeys(o.samples.flight for o in observed))
 
 
@@ -872,11 +872,11 @@ def crps_difference(
 
 
 def _sd_factor(flights: Sequence[str], parts: Sequence[_HeldOut]) -> float:
-    """Return the ratio of actual to stated errors of held-out parts, limited to 0.8 to 1.6, or 1 without errors.
+    """Return the ratio of actual to stated errors of held-out parts, limited to 0.8 to 1.6. It is 1 without errors.
 
-    The ratio is the geometric mean over flights. A model that was learned from flights with small errors states a too
-    small error for a flight with large errors, and vice versa. An arithmetic mean would give more weight to the first
-    case, although the final model is fitted to all flights.
+    The ratio is the geometric mean over flights. A model that was learned from flights with small errors states an
+    error that is too small for a flight with large errors, and vice versa. An arithmetic mean would give more weight to
+    the first of these cases, although the final model is fitted to all flights.
     """
     squares = lists_by_key(zip(flights, (np.square(error / sd) for error, sd in parts), strict=True))
     means = [_mean(np.concatenate(each)) for each in squares.values()]

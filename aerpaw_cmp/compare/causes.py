@@ -1,8 +1,9 @@
 """Likely cause of a level error: the most likely fault of the log, its settings or the site.
 
 Each fault changes the predicted level in one of three ways: by known decibels, by columns with free coefficients, or at
-samples that the receiver clipped. Clipped samples are predicted by their own mean, and they fade less. The offset is
-fitted as well. The residual is noise with a long and a short correlation time, because slow fading is not a fault.
+samples that the receiver clipped. The level of clipped samples is predicted by their own mean, and they fade less than
+other samples. The offset is fitted as well. The residual is modelled as noise with a long and a short correlation time,
+so that slow fading is not mistaken for a fault.
 
 An explanation is a single fault or a pair, and the second fault of a pair is searched for in the residual after the
 first. Explanations are compared by their marginal likelihood over all channels. Coefficients, angles, heights,
@@ -45,7 +46,8 @@ from .statistics import is_flat
 # Prior and limit of the log odds: a fault occurs in one of ten flights, and is named if its odds are at least five to
 # one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
-# Largest number of words in the sentence and the next step of a cause, because the first paragraph has at most sixty.
+# Largest number of words in the sentence and the next step of a cause, because the first paragraph of a page has at
+# most sixty words.
 MOST_CAUSE_WORDS = 28
 # A cause must reduce the RMSE by this share. Half of the share suffices if the log odds per channel reach the second
 # number: correcting a floor, for example, does not change the error of the levels above the floor. An unnamed cause
@@ -60,7 +62,7 @@ _UNNAMED = ""
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """A fault with its numbers, its effect on the level, and its sentence.
+    """A possible fault with given numbers, its effect on the predicted level, and its sentence in the report.
 
     ``change_db`` (n,) is added to the predicted level. ``columns`` (n, k) have free coefficients with a unit normal
     prior. ``clipped`` (n,) marks samples whose level does not depend on the link. ``fading`` (n,) is the share of the
@@ -87,7 +89,7 @@ class Trial:
 
     @cached_property
     def designs(self) -> tuple[Columns, ...]:
-        """The columns as one object for many fits, which whiten them only once. Empty if there are none."""
+        """The columns as one object for many fits, which whiten them only once. Empty if the trial has no columns."""
         return () if self.columns is None else (Columns(self.columns),)
 
 
@@ -137,15 +139,15 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             if any(either <= pair for pair in named):
                 continue
             lead = _lead(either, odds) / len(showing)
-            # after an almost certain cause, an error with an uncertain second cause may remain, so also judge both
-            # together
+            # an almost certain cause may leave an error that only an uncertain second cause explains, so also judge it
+            # together with the likeliest explanation
             apart = (beside, best) if lead >= _CERTAIN else (beside,)
             if any(all(_explains(other, showing, lead, rest - either) for other in either) for rest in apart):
                 named[either] = showing
         rejected = certain - frozenset().union(*named)
         if not rejected:
             break
-        # in the second pass, a cause that was rejected does not explain any part of the error
+        # in the second pass, do not let a rejected cause explain a part of the error
         beside = certain - rejected
     # if an almost certain cause was rejected, no explanation fits, so do not name a gain over directions
     if any(_lead({other}, odds) >= _CERTAIN for other in rejected):
@@ -173,7 +175,8 @@ def _likeliest_first(either: Set[str], best: Set[str], odds: Mapping[frozenset[s
 def _channels_showing(either: Set[str], best: Set[str], tables: Sequence[_Models]) -> list[_Models]:
     """Return the channels that must show a cause (or one of two causes), the clearest first."""
     name = max(either & best)
-    # an error of the UAV's height or attitude, or of a tower's position, must appear on all of its channels
+    # an error of the UAV's height or attitude must appear on all channels, and an error of a tower's position on all
+    # channels of this tower
     of_all = all(_conditions(each).of_uav for each in either)
     shown = [table for table in tables if of_all or name in _names(_best(table, best))]
     if any(_conditions(each).of_tower for each in either):
@@ -194,10 +197,10 @@ def _unpaid(models: Sequence[_Model]) -> float:
 
 
 def _by_health(cause: Cause | None, tables: Sequence[_Models]) -> Cause | None:
-    """Return the cause after comparing steps and offsets with steps and offsets of held-out flights.
+    """Return the cause after a comparison of steps and offsets of the level with those of held-out flights.
 
-    A fit within a flight cannot distinguish a step from slow fading. If the usual errors of all channels are known,
-    they decide.
+    A fit within a flight cannot distinguish a step from slow fading. If the usual errors of all channels are known from
+    held-out flights, they decide whether a step is named.
     """
     known = [(judged, table) for table in tables if (judged := _judged(table[_SOUND])) is not None]
     if not known:
@@ -260,7 +263,7 @@ def _lead(names: Set[str], odds: Mapping[frozenset[str], float]) -> float:
 
 
 def _alternatives(best: Set[str], odds: Mapping[frozenset[str], float], least: float) -> list[frozenset[str]]:
-    """Return the causes that are likelier than all others by a margin. Indistinguishable pairs come first."""
+    """Return causes that are likelier than all others by a margin. Pairs that cannot be distinguished come first."""
     out = []
     leads = {name: _lead({name}, odds) for name in sorted(best - {_UNNAMED})}
     certain = {name for name, lead in leads.items() if lead >= least + 2.0 * _DISTINCT}
@@ -286,14 +289,14 @@ class _Conditions:
     Parameters
     ----------
     lead : float
-        Log odds per channel against all explanations without it.
+        Smallest log odds per channel against all explanations without the cause.
     share : float
         Smallest reduction of the RMSE, as a share.
     learned_share : float
-        The same for learned antennas, with which every flight has an error of a few decibels.
+        The same for flights with learned antennas, which all have an error of a few decibels.
     part : float
         Smallest reduction of the error that remains after the other causes, as a share of the reduction by all
-        candidates. It applies to flights without learned antennas.
+        candidates. This condition applies only to flights without learned antennas.
     of_uav : bool
         True if the cause changes the levels of all channels.
     of_tower : bool
@@ -393,12 +396,13 @@ def _holds_in_halves(models: Sequence[_Model], most: float) -> bool:
 
 
 # A gain is fitted to one half of the flight and tested on the other half, where it must reduce the RMSE at least to the
-# first share. The second share is used instead with learned antennas, and if the gain reduces the RMSE of the complete
-# flight at least to the third share. Such a gain is plausible, although halves of a short flight show few directions.
+# first of these shares of its value. The second share is used instead with learned antennas, or if the gain reduces the
+# RMSE of the complete flight at least to the third share. A gain is then plausible although it fits the other half less
+# well, because each half of a short flight contains few directions.
 _MOST_IN_HALVES, _MOST_OF_ERROR = (0.75, 0.85), 0.5
-# Number of means per independent sample of the error. Halves may have different directions, so the test of halves is
-# skipped if the log odds per channel reach the second number. Even learned antennas have an error of 3 dB and more, so
-# a pattern is not the cause of an error below the last number [dB].
+# Number of consecutive means that count as one independent sample of the error. The two halves may contain different
+# directions, so the test of halves is skipped if the log odds per channel reach the second number. Even learned
+# antennas have an error of 3 dB and more, so a pattern is not the cause of an error below the last number [dB].
 _CORRELATED_BINS, _SURE_GAIN, _LEAST_DB = 10.0, 20.0, 2.5
 
 
@@ -455,7 +459,7 @@ _MOST_TRIED, _MOST_FIRST = 6, 2
 
 
 def _models(e: LevelEvidence) -> _Models:
-    """Return the likeliest model of each fault, and of pairs of the best faults."""
+    """Return the likeliest model of each fault, and of pairs of the likeliest faults."""
     sound = _fitted(e)
 
     def model(*trials: Trial, at: NoiseParameters = sound.parameters, search: bool = True) -> _Model:
@@ -467,8 +471,8 @@ def _models(e: LevelEvidence) -> _Models:
     def best_of(sets: Iterable[tuple[Trial, ...]], at: NoiseParameters) -> list[_Model]:
         """Return the likeliest model of each set of names, best first, with its own noise.
 
-        Trials without a name that change levels are separate from trials that add a gain, because the order of both
-        kinds can change if the noise changes.
+        Trials without a name that change levels are kept apart from trials without a name that add columns, because the
+        parameters of the noise can decide which of these two kinds is likelier.
         """
         best: dict[tuple[frozenset[str], bool], _Model] = {}
         for trials in sets:
@@ -532,7 +536,7 @@ def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause
     )  # fmt: skip
 
 
-# Where a next step changes flight.yaml. The last word is replaced by the channels of the named cause.
+# The place in flight.yaml that a next step changes. The last word is replaced by the channels of the named cause.
 _CHANNELS = "CHANNELS"
 _IN_LOGS = f"in `logs:` for {_CHANNELS}"
 
@@ -558,7 +562,7 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, searc
     residual[link] = fit.residual_db * scale
     if clipped.any():  # clipped levels do not depend on the link
         residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
-        # Schwarz's penalty for two fitted numbers, mean and spread
+        # Schwarz's penalty for two fitted numbers, mean and standard deviation
         spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
         likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
     return NoiseFit(likelihood, residual, fit.parameters)
@@ -586,7 +590,8 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         estimate = lag, *e.clock.ci95_s
         yield Trial(name="clock", sentence=sentence, next_step=step, change_db=change_db, estimate=estimate)
     yield from _drifting(e)
-    # also try levels of another time or in reverse order: otherwise another cause would be named for them
+    # also try the predicted levels of other times and in reverse order: a log with such an error would otherwise be
+    # attributed to another cause
     since, length = e.time_s - e.time_s[0], max(float(np.ptp(e.time_s)), 1e-9)
     backwards = np.interp(length - since, since, e.predicted_db)
     channels = 1 + len(e.others)  # all channels share the telemetry, so they share the cost
@@ -604,7 +609,7 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _drifting(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the likeliest radio clock that gains or loses time and is right at one instant of the flight."""
+    """Yield the likeliest constant drift of a radio clock that is right at one time of the flight."""
     if e.clock is None:
         return
     middle, length = 0.5 * (e.time_s[0] + e.time_s[-1]), float(np.ptp(e.time_s))
@@ -652,7 +657,7 @@ def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
     return np.asarray((e.measured_db - level_db).std(axis=-1) <= (1.0 - _LEAST_SHARE) * error_db)
 
 
-# Lags of a clock without a test result [s]. Beyond them, the step is twice as large.
+# Lags that are tried if the clock test did not find a lag [s]. Larger lags are tried with twice the step.
 _LAG_STEP_S = 2.0
 _LAGS_S = np.arange(-60.0, 61.0, _LAG_STEP_S)
 
@@ -717,7 +722,7 @@ def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
 
 
 def _heading(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a UAV antenna that is rotated about the vertical axis."""
+    """Yield the trial that the UAV antenna is rotated about the vertical axis."""
     if e.turned_db:
         # the heading is less likely to be wrong if the logged attitude is not used
         cost, step = _RARE if "logged" in e.attitude_db else 0.0, "check the antenna's mount and the logged yaw"
@@ -726,7 +731,7 @@ def _heading(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield an attitude that the settings do not use, or should not use."""
+    """Yield the trials that the attitude should be used although the settings ignore it, or the reverse."""
     for mode, change in e.attitude_db.items():
         cost, sentence = 0.0, "the UAV's attitude is not used"
         if mode == "ignored":  # ignoring a logged attitude is the less likely remedy
@@ -775,7 +780,7 @@ def _misread(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the log of another tower."""
+    """Yield the trials that the log belongs to another tower."""
     for name, level in e.other_towers_db.items():
         sentence, step = f"the log comes from {name}", f"`node: {name}` {_IN_LOGS}"
         if name in e.towers:  # a tower cannot have two logs of one channel, so the logs are swapped
@@ -785,7 +790,7 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _place(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the likeliest position of the tower near that in the site file, or the opposite shift of the track."""
+    """Yield the trial that the tower is elsewhere near its position in the site file, or the track is shifted."""
     if not e.displaced_db:
         return
     radii = np.array(sorted({radius for radius, _ in e.displaced_db}))
@@ -811,13 +816,14 @@ def _place(e: LevelEvidence) -> Iterator[Trial]:
     yield Trial(name="place", cost=cost, change_db=changes[best], estimate=estimate, sentence=sentence, next_step=step)
 
 
-# Distance [m] beyond which positions become unlikely, and steps between the computed positions.
+# Distance [m] beyond which positions become unlikely, steps between the computed positions, and steps of azimuth over
+# which a spline is fitted.
 _NEAR_PLACE_M, _FINER, _AROUND = 50.0, (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75), np.arange(-4, 5)
 _SIDES = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
 def _channels(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield swapped logs of two channels of the tower."""
+    """Yield the trial that the logs of the two channels of the tower are swapped."""
     if len(e.others) != 1 or e.others[0].unit != e.unit:
         return
     change_db = np.interp(e.time_s, _seconds(e.others[0], e), e.others[0].predicted_db) - e.predicted_db
@@ -836,7 +842,7 @@ CATCH_ALL = "pattern"
 
 # Causes that depend on the direction alone, and therefore imitate errors of the propagation model.
 OF_DIRECTION = frozenset({"blocked", CATCH_ALL})
-# Causes that a step replaces if held-out flights do not have a step like it.
+# Causes that are replaced by a gain step if held-out flights do not have such a step.
 _OF_HEALTH = OF_DIRECTION | {"gain step"}
 
 _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT`"
@@ -848,7 +854,7 @@ _PATTERN = {
 
 
 def _pattern(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a smooth gain over the directions of the UAV's antenna instead of the known gain."""
+    """Yield the trial of a smooth gain over the directions of the UAV's antenna instead of the known gain."""
     azimuth, elevation = np.radians(e.uav_azimuth_deg), np.radians(e.uav_elevation_deg)
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
@@ -866,7 +872,7 @@ _RARE = 3.0
 
 
 def _cell(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a level that changes with the serving cell."""
+    """Yield the trial of a level that changes with the serving cell."""
     if e.serving is not None and np.ptp(e.serving) > 0.5:
         sentence, step = "the level steps when the phone changes its serving cell", "compare the cells separately"
         yield Trial(name="cell", sentence=sentence, next_step=step, columns=_STEP_DB * e.serving[:, None])
@@ -876,7 +882,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     """Yield trials in which all levels in dB are halved, doubled (amplitude read as power, or vice versa) or negated.
 
     The interval of the slope must support the factor, and a path-loss exponent and a gain over elevation, which change
-    levels in the same way, must be much less likely than the factor.
+    levels in a similar way, must be much less likely than the factor.
     """
     up = np.sin(np.radians(e.uav_elevation_deg))
     elevation = _GAIN_DB * np.column_stack([up, up**2, up**3])
@@ -909,7 +915,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
         fit = _fitted(e, trial)
         fits = ((_fitted(e, other, at=fit.parameters) for other in of) for of in (slopes, others))
         slope, apart = (max(other.log_likelihood for other in of) for of in fits)
-        # above a floor, logged levels change by fewer decibels than the link
+        # skip this comparison if there is a floor, above which logged levels change by fewer decibels than the link
         least = -math.inf if e.floored else apart + _RARE
         if _is_slope(e, factor, fit.parameters) and fit.log_likelihood > max(least, slope):
             yield trial
@@ -933,7 +939,7 @@ _SLOPE = 0.5
 # Smallest slope that is attributed to a path-loss exponent: heights and antennas change the slope by less. Largest
 # height of a receiver among obstacles [m].
 _STEEP, _NEAR_GROUND_M = 1.25, 10.0
-# Largest relative difference of a slope from these factors, for any antennas and for learned antennas. The slope of
+# Largest relative difference of a slope from these factors, for other antennas and for learned antennas. The slope of
 # learned antennas is 0.95 to 1.09 on held-out flights of dataset 12, and 0.9 on the LTE flight at 50 m.
 _SLOPE_SHARE, _LEARNED_SLOPE_SHARE = {-1.0: 0.25, 0.5: 0.1, 2.0: 0.05}, {-1.0: 0.25, 0.5: 0.12, 2.0: 0.1}
 
@@ -982,16 +988,16 @@ _CONTROLS_S = (10.0, 20.0, 40.0)
 
 
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the loss of receiver lock, if the log contains samples without lock. Levels without lock are noise."""
+    """Yield the trial of a lost receiver lock, if the log has samples without lock. Their levels are noise."""
     if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
         # the report has a caution with the number of these samples, and its first sentence already states the error
-        # with the floor. The log itself shows this fault, so there is no penalty for being rare.
+        # with the floor. The log itself shows this fault, so cancel the prior odds against a fault.
         sentence = "the receiver had no lock in parts of the flight"
         yield Trial(name="lock", cost=-_SELDOM, clipped=lost, sentence=sentence)
 
 
 def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield missing detection, if many samples have the lowest level of the log."""
+    """Yield the trial that the receiver did not detect the signal at samples with the lowest level, if many have it."""
     if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
         # levels that vary are noise. Means over seconds vary less, so a margin above the median is enough.
@@ -1003,7 +1009,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _limits(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a floor and a ceiling of the level.
+    """Yield trials of a floor and a ceiling of the level.
 
     For a level that is constant throughout, yield only an input without signal.
     """
@@ -1020,7 +1026,8 @@ def _limits(e: LevelEvidence) -> Iterator[Trial]:
         yield from _clipping(e, -1.0)
 
 
-# A small share of samples may be beyond a limit by more than the first number [dB].
+# At a limit, at most the second number (a share) of the measured levels are beyond it by more than the first number
+# [dB].
 _BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
 _FAR_DB, _LEAST_FAR = 3.0, 0.1
 
@@ -1110,7 +1117,7 @@ _MOST_STARTS = 600
 
 
 def _blocked(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a loss in a sector of directions from the tower, searched in steps of 5 degrees, then of 1 degree."""
+    """Yield trials of a loss in a sector of directions from the tower, searched in steps of 5, then of 1 degree."""
     residual = e.measured_db - e.predicted_db
     coarse = [(middle, width) for width in _WIDTHS_DEG for middle in np.arange(0.0, 360.0, 5.0).tolist()]
     shadows = _shadows(e, coarse)
@@ -1149,7 +1156,7 @@ _CHECK_GAIN = "check the receiver's gain; compare both parts separately"
 
 
 def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield a shift of the level from some time until the end of the flight."""
+    """Yield trials of a shift of the level from some time until the end of the flight, and of a gain that drifts."""
     n = len(e.time_s)
     starts = np.arange(LEAST_BINS * 2, n - LEAST_BINS * 2)
     if not len(starts):
@@ -1158,7 +1165,7 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     starts = starts[:: 1 + len(starts) // _MOST_STARTS]
     # a gain that drifts is an alternative to a step
     yield Trial(columns=_STEP_DB * (np.arange(n) / n)[:, None])
-    # the channels of a tower step at the same time
+    # a gain step is assumed to occur at the same time on all channels of a tower
     channels = (e, *e.others)
     masks = [(_seconds(c, e)[None, :] >= e.time_s[starts][:, None]).astype(np.float64) for c in channels]
     errors = [c.measured_db - c.predicted_db for c in channels]

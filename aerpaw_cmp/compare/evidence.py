@@ -15,8 +15,8 @@ from .result import ClockResult
 
 # Samples are averaged over this time [s]. Longer flights have longer means, so that their number is limited.
 BIN_S, _MOST_BINS = 1.0, 2000
-# Means between which the UAV moves [m] and turns [deg] by less than this are joined, because the fading of a hover is
-# one number and not many. A slow orbit at 1.5 m/s is not joined.
+# Consecutive means are joined while the UAV moves [m] and turns [deg] by less than this, because fading hardly changes
+# in a hover, so the means are not independent. A slow orbit at 1.5 m/s is not joined.
 _NEAR_M, _NEAR_DEG = 1.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 FEWEST_SAMPLES = 100
@@ -145,7 +145,7 @@ def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
         if name not in ("uav_azimuth_deg", "tower_azimuth_deg"):
             # treat missing flags as 1: a gap in the log is not an error
             return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
-        # average directions, because the mean of 359 and 1 degrees is 0
+        # average unit vectors, because the mean direction of 359 and 1 degrees is 0, not 180
         turn = np.exp(1j * np.radians(value))
         return np.degrees(np.angle(mean(turn.real) + 1j * mean(turn.imag)))
 
@@ -196,7 +196,7 @@ _AT_END, _SHARE_AT_END = 10, 0.01
 
 
 def _undetected(level_db: FloatArray) -> BoolArray | None:
-    """Return samples (n,) without detection: near or below the most frequent level, if links drop to it suddenly.
+    """Return samples (n,) without detection: near or below the most frequent level, if levels drop to it suddenly.
 
     Return None if the level fades slowly into the densest level, as near a floor or in a hover.
     """

@@ -210,7 +210,7 @@ def prior_sd_db(model: FieldModel, parts: Collection[Part]) -> float:
 
 @dataclass(frozen=True)
 class FieldFit:
-    """The process conditioned on rows. The standard deviations do not depend on the values ``value_db`` (n,)."""
+    """The Gaussian process conditioned on rows. The SDs do not depend on the values ``value_db`` (n,)."""
 
     model: FieldModel
     rows: Rows

@@ -239,7 +239,7 @@ class GainModel:
 
 
 def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
-    """Return the argument of a term: directions (n, 3) in its frame, or (n, 6) for the pair of both."""
+    """Return the argument of a term: directions (n, 3) in its frame, or (n, 6) at both ends for a pair."""
     if frame == "pair":
         return np.concatenate([samples.at_uav, samples.at_tower], axis=1)
     return samples.at_uav if frame == "body" else samples.at_tower
@@ -265,7 +265,10 @@ def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=len(ANTENNA_TERMS))
 def _last_kernel(term: Term, at: bytes, to: bytes) -> FloatArray:
-    """Return :func:`term_kernel` of float64 arrays given as bytes. Cached: channels of a log have equal directions."""
+    """Return :func:`term_kernel` of float64 arrays given as bytes.
+
+    The result is cached, because the channels of a log have equal directions.
+    """
     width = 6 if term.frame == "pair" else 3
     return term_kernel(term, np.frombuffer(at).reshape(-1, width), np.frombuffer(to).reshape(-1, width))
 
@@ -400,7 +403,7 @@ class GainFit:
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return posterior mean and SD of the gain at one end over directions (n, 3), or of the pair (n, 6) [dB].
 
-        Zero is the mean over the bins of the flights, because offsets contain the level.
+        The gain is relative to its mean over the bins of the flights, because the offsets absorb this mean.
         """
         return self.predict(directed(antenna, np.asarray(direction, dtype=np.float64)), (frame,))
 
@@ -541,7 +544,7 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
     factor = Factor.of(covariance)
     target = np.concatenate([_centred(s) for s in rows])
     weights = factor.solve(target)
-    # multiply by the covariance of the gains to get the part of the levels that they explain
+    # subtract the part that offset, nuisance and noise explain, so that the part that the gains explain remains
     parts = np.split(weights, np.cumsum([len(s) for s in rows])[:-1])
     gain = target - np.concatenate([own_covariance(model, s) @ w for s, w in zip(rows, parts, strict=True)])
     if scaled:
@@ -754,7 +757,7 @@ USUAL_OFFSET_DB = 1.5
 
 
 def offset_sd_db(squares_db2: float, count: int, usual_db: float = USUAL_OFFSET_DB) -> float:
-    """Return the SD of a normal distribution that has the 90 % band of the offset of a new flight [dB].
+    """Return the SD of a normal distribution with the same 90 % band as the offset of a new flight [dB].
 
     ``squares_db2`` is the sum of squared deviations of the flights' offsets from their mean, with ``count`` degrees of
     freedom. The SD between flights is integrated over its posterior distribution, because few flights hardly determine
@@ -1008,7 +1011,7 @@ _MOST_ROWS, _BIN_S = 700, 4.0
 # Candidate standard deviations of nuisance and noise [dB], selected by likelihood for each series.
 _SCALES_DB = (0.7, 1.2, 2.0, 3.5, 6.0)
 
-# Share of the variance of the joint gain of both ends that its table does not explain.
+# Share of the prior variance of the joint gain of both ends that a learned table of this gain does not explain.
 _PAIR_LEFT = 0.5
 
 # Mean (n,) [dB] and covariance (n, n) [dB^2] of a learned gain along samples.

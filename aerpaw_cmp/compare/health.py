@@ -176,11 +176,11 @@ def _decay(apart: Sequence[FloatArray], errors: Sequence[FloatArray], longest: f
 
 # --- a later flight -------------------------------------------------------------------------------------------------
 
-# Smallest chi-squared of a step on two channels, and the amount added per further channel. Healthy flights exceed it
-# once in a thousand. In simulated healthy flights of 830 s, 95 % are below 14 to 15, and 99 % below 17 to 20.
+# Smallest chi-squared of a step on two channels, and the amount added per further channel. One in a thousand healthy
+# flights exceeds this limit. In simulated healthy flights of 830 s, 95 % are below 14 to 15, and 99 % below 17 to 20.
 _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
-# Twice the log likelihood of a step must exceed that of a slower change, over these times [s] or over the flight, by
-# this.
+# Chi-squared of a step must exceed that of a slower change by the first number. A slower change takes one of these
+# times [s] or the whole flight.
 _BEFORE_SLOWER, _SLOW_S = 5.0, (100.0, 200.0)
 # A step must reduce the variance of the errors by at least this share of its own variance.
 _LEAST_TAKEN = 0.5

@@ -264,7 +264,7 @@ def _rows(
                           free_offset=False, place_m=place)
         for errors in ladder.error_db
     ]  # fmt: skip
-    # sufficient are the best model, and each model whose difference from it has an interval that contains 0
+    # a model is sufficient if it is the best model, or if the interval of its difference from the best model contains 0
     sufficient = [i for i, pair in enumerate(pairs) if i == ladder.best or pair.difference_ci95_db[0] <= 0.0]
     fastest = min(sufficient)  # by the order of candidates, because measured seconds vary between runs
     return [

@@ -158,7 +158,8 @@ def compare_rss(
 
 
 def _fit(measured_db: FloatArray, simulated_db: FloatArray, span_db: tuple[float, float]) -> OffsetFit:
-    # an offset fits a single sample exactly, and with two samples the RMSE is half of their difference
+    # do not return an RMSE for one or two samples: an offset fits one sample exactly, and the RMSE of two samples is
+    # half the difference of their errors
     fit = grid_offset(measured_db, simulated_db, span_db=span_db)
     return fit if fit.n > 2 else replace(fit, rmse_db=np.nan)
 
@@ -728,7 +729,8 @@ def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, 
 # Time between two values of AERPAW's sounder [s]: 4095 chips plus overhead of the correlation.
 BASE_S = 0.032768
 
-# The time base of the sounder is used if it raises the correlation by more than this.
+# The quality is moved to the time base of the sounder if this raises its correlation with the power by more than this
+# number.
 _BETTER = 0.1
 
 
@@ -889,7 +891,7 @@ def nearest_points(
             for place, nose in zip((samples, points), nose_deg, strict=True)
         )
     known = np.asarray(np.isfinite(samples).all(axis=1))
-    # near points are within 2**0.5, and the bound speeds up the search for far samples
+    # near points are within 2**0.5 in these scaled coordinates, and the bound speeds up the search for far samples
     index = cKDTree(points).query(np.where(known[:, None], samples, 0.0), distance_upper_bound=1.5)[1]
     index = np.minimum(index, len(points) - 1)
     away = samples - points[index]

@@ -35,7 +35,8 @@ class Case:
     azimuth_db, airframe_db : float
         Standard deviation of the node's gain over azimuth, and of the airframe's gain over its directions [dB].
     learned : bool
-        True if the learned gain of the airframe is used. Then ``airframe_db`` is a factor of its standard deviation.
+        True if the learned gain of the airframe is used. ``airframe_db`` is then a factor of the learned standard
+        deviation.
     log_weight : float
         Logarithm of the prior weight.
     """
@@ -55,7 +56,7 @@ class Case:
         return self.shadow_db, self.scatter_db, self.length_m, self.time_s
 
     def with_gains(self, azimuth_db: float, airframe_db: float, weight: float = 1.0) -> Case:
-        """Return the case with unknown gains over direction [dB], and its weight."""
+        """Return the case with unknown gains over direction, with standard deviations [dB], and with a prior weight."""
         return replace(self, azimuth_db=azimuth_db, airframe_db=airframe_db, log_weight=float(np.log(weight)))
 
     def with_airframe(self) -> Case:
@@ -70,9 +71,8 @@ class LevelModel:
     Parameters
     ----------
     slope, slope_sd : float
-        Exponent of the distance.
-    elevation_sd_db : float
-        Standard deviation of the gain over elevation, from both antennas and the ground.
+        Exponent of the distance. elevation_sd_db : float Standard deviation of the gain over elevation, from both
+        antennas and the ground.
     cases : tuple of Case
         Cases over which the evidence is averaged, by their weights.
     """
@@ -90,14 +90,15 @@ _LEARNED_SD = 0.25
 # Prior log odds of a learned gain against an unknown gain.
 _KNOWN_ODDS = 3.0
 
-# Gains over azimuth and over the directions of the airframe [dB]. If the attitude is unknown, the axes of the airframe
-# are those of the site, and stronger gains are also tried, with weights. If the attitude is known, stronger gains are
-# not tried: they raised the error of one of six real flights from 41 to 67 m.
+# Standard deviations of the gain over azimuth at the node and over direction at the airframe [dB]. If the attitude is
+# unknown, the airframe's axes are taken as those of the site, and larger standard deviations are also tried, with the
+# prior weights below. If the attitude is known, larger ones are not tried: they raised the error of one of six real
+# flights from 41 to 67 m.
 _GAINS = (0.8, 1.5)
 _STRONG_GAINS = {_GAINS: 0.55, (3.0, 3.0): 0.28, (6.0, 6.0): 0.17}
 
-# Shadowing is correlated over half a minute, which matters in a hover, and over position. Strong shadowing over a short
-# length with little scatter is not tried, because it is hard to distinguish from strong scatter.
+# Shadowing is correlated either over half a minute, which matters in a hover, or over position. Strong shadowing over a
+# short length with little scatter is not tried, because it is hard to distinguish from strong scatter.
 _LENGTHS_M = (15.0, 45.0, 100.0)
 _SHADOWS = (
     Case(shadow_db=8.0, scatter_db=4.0, time_s=30.0),
@@ -156,7 +157,7 @@ _AFAR_M, _PLACED_ODDS = 30_000.0, 0.5
 # Positions are ignored if their log evidence is lower than the maximum by more than this.
 _POSSIBLE = 8.0
 
-# Number of the likeliest positions whose spacing is divided by three to the east and to the north.
+# Number of the likeliest positions around which the spacing is divided by three to the east and to the north.
 _MOST_REFINED = 100
 
 # Prior standard deviation of the level at 100 m, which is unknown.
@@ -216,7 +217,7 @@ def level_track(
 ) -> LevelTrack:
     """Return medians of levels over windows of :data:`WINDOW_S` or longer.
 
-    A median is below the floor if more than half of the samples in its window are.
+    A median is below the floor if more than half of the samples in its window are below the floor.
 
     Parameters
     ----------
@@ -381,7 +382,7 @@ def _fit_case(case: Case, above: FloatArray, below: FloatArray, shadow: _Shadowi
         mean = (terms @ pull[:, :, None])[:, :, 0] - below[:, :, -1]
         held, force = _below_floor(mean, shadow.left + terms @ terms.swapaxes(1, 2), case.scatter_db)
         evidence, pull = evidence + held, pull + (terms.swapaxes(1, 2) @ force[:, :, None])[:, :, 0]
-    # use the variance given the levels above the floor, because other levels hardly reduce it
+    # use the variance given the levels above the floor, because the levels below the floor hardly reduce it
     return evidence, (inverse[:, :, 1] * pull).sum(axis=1), (inverse[:, :, 1] ** 2).sum(axis=1)
 
 
@@ -475,7 +476,7 @@ class Regions:
 
     def likeliest(self) -> FloatArray:
         """Return the middle (2,) of the likeliest cell."""
-        # round, so that rounding does not decide between a position and its mirror image
+        # round the shares, so that floating-point errors do not decide between a position and its mirror image
         column, row = np.unravel_index(self.share.round(12).argmax(), self.share.shape)
         return np.array([self.east_m[column], self.north_m[row]])
 
@@ -487,7 +488,7 @@ class Regions:
         return held.reshape(self.share.shape)
 
     def modes(self, part: float = 0.9) -> tuple[Mode, ...]:
-        """Return the connected parts of the region that contains a share of the posterior, the likeliest first."""
+        """Return the connected parts, likeliest first, of the region with the share ``part`` of the posterior."""
         from scipy.ndimage import label
 
         # cells that touch at a corner are connected
@@ -502,7 +503,7 @@ class Regions:
         return tuple(sorted((mode for mode in out if mode.share >= _LEAST_SHARE), key=lambda mode: -mode.share))
 
     def radius_m(self, place_m: FloatArray, part: float) -> float:
-        """Return the radius of the circle about a position that contains a share of the posterior."""
+        """Return the radius of the circle about a position that contains the share ``part`` of the posterior."""
         east, north = np.meshgrid(self.east_m - place_m[0], self.north_m - place_m[1], indexing="ij")
         return _within(np.column_stack([east.ravel(), north.ravel()]), self.share.ravel(), part)
 
@@ -522,7 +523,7 @@ def _blurred(places: FloatArray, share: FloatArray, axes: Sequence[FloatArray], 
 
 
 def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
-    """Return the radius that contains a part of the shares (n,) at steps (n, 2) from the centre."""
+    """Return the radius [m] within which the fraction ``part`` of the shares (n,) lies."""
     away = np.hypot(*step_m.T)
     order = np.argsort(away)
     held = np.cumsum(share[order])
@@ -747,7 +748,7 @@ def place_odds(track: LevelTrack, known_m: ArrayLike) -> FloatArray:
     Parameters
     ----------
     track : LevelTrack
-        Track, whose antennas count as unknown, and whose levels below the floor count as levels at the floor.
+        Track. Its antennas are treated as unknown, and levels below the floor as levels at the floor.
     known_m : (k, 3)
     """
     from scipy.special import logsumexp

@@ -36,7 +36,7 @@ class NoiseParameters(NamedTuple):
 
     @property
     def log_prior(self) -> float:
-        """Log prior density of the parameters: log normal in slow correlation times that are longer than usual.
+        """Log prior density of the parameters: log-normal in unusually long slow correlation times, else constant.
 
         Without this prior, fading that lasts minutes could explain every error.
         """
@@ -84,7 +84,7 @@ def _whitening(parameters: NoiseParameters) -> tuple[tuple[float, float, float],
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """One or more columns (n, k) of a design, which many fits share. For each noise, they are whitened only once."""
+    """One or more columns (n, k) of a design matrix, whitened only once per set of noise parameters for many fits."""
 
     values: FloatArray
     _white: dict[NoiseParameters, FloatArray] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -180,7 +180,10 @@ LEAST_VARIANCE = 1e-12
 def shifts_in_masks(
     residual: FloatArray, masks: FloatArray, phis: Sequence[float]
 ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Return the level shift in each mask (m, n), its standard error and the gain in log likelihood, for each phi."""
+    """Return the level shift in each mask (m, n), its standard error and its gain in log likelihood.
+
+    The list has one entry for each lag-one autocorrelation in ``phis``.
+    """
     before, after = masks[:, :-1], masks[:, 1:]
     sums = after.sum(axis=1), before.sum(axis=1)
     squares = [np.einsum("ij,ij->i", *of) for of in ((after, after), (after, before), (before, before))]
@@ -200,7 +203,9 @@ def shifts_in_masks(
 
 
 def squares_of_halves(error: FloatArray, columns: FloatArray, memory: float) -> tuple[float, float]:
-    """Return the sums of squares of an error (n,) without and with a fit of columns (n, k) to the other half.
+    """Return the sums of squares of an error (n,), without and with a fit of columns (n, k).
+
+    Each half of the flight is tested with coefficients that were fitted to the other half.
 
     ``memory`` is the number of consecutive samples that count as one independent sample of the error.
     """

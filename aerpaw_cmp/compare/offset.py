@@ -26,7 +26,7 @@ MAXIMUM_OFFSETS = 10_000_000
 # Largest magnitude of a level that is used [dB]. Larger levels are clipped to it.
 _LARGEST_DB = 1e150
 
-# Distances that differ by less than this share of a step are equal (0.15 is exactly between 0.1 and 0.2).
+# Distances that differ by less than this share of a step count as equal (0.15 is exactly between 0.1 and 0.2).
 _TIE = 1e-9
 
 
@@ -147,7 +147,8 @@ def grid_offset(
     Returns
     -------
     OffsetFit
-        The best offset, to be added to the measurement. Of two equally good offsets, it is the smaller magnitude.
+        The best offset, to be added to the measurement. Of two equally good offsets, the one with the smaller magnitude
+        is used.
 
     Raises
     ------
@@ -157,7 +158,7 @@ def grid_offset(
     Notes
     -----
     The best offset is the mean difference, rounded to the grid (:meth:`Moments.rmse_db`). Sums of squares of shifted
-    levels would not be accurate enough to decide between two equal offsets. Source: arXiv 2502.10324, section V.
+    levels would not be accurate enough to decide between two equally good offsets. Source: arXiv 2502.10324, section V.
 
     Examples
     --------

@@ -222,8 +222,9 @@ def confusion_matrix(measured: ArrayLike, simulated: ArrayLike) -> IntArray:
 def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     """Return Cohen's kappa: the agreement beyond chance, given both histograms.
 
-    Kappa is 1 if the ranks are always equal, and 0 if they agree as often as by chance. Kappa is NaN without a pair,
-    and for two equal constants. Cohen (1960), doi:10.1177/001316446002000104.
+    Kappa is 1 if the ranks are always equal, and 0 if they agree as often as by chance. Kappa is NaN if no sample has
+    both ranks, or if all measured and simulated ranks are the same number. Cohen (1960),
+    doi:10.1177/001316446002000104.
 
     Examples
     --------
@@ -240,13 +241,13 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 
 
-# Number of parts of a flight that are swapped. With twelve parts, a part is much longer than most correlation times,
-# and there are 2048 combinations of swaps.
+# Number of parts of a flight in which measured and simulated ranks are swapped. With twelve parts, a part is much
+# longer than most correlation times, and there are 2048 combinations of swaps.
 _PARTS = 12
 
 
 def histogram_test(measured: ArrayLike, simulated: ArrayLike) -> float:
-    """Return the p-value of the total variation between both histograms, from swaps of parts of the flight.
+    """Return the p-value of the total variation distance of both histograms, from swaps in parts of the flight.
 
     If measured and simulated ranks had the same distribution, swapping them in a part of the flight would have no
     effect on average.
@@ -287,7 +288,7 @@ def k_grid() -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class KCurve:
-    """The agreement as a function of continuous K.
+    """The agreement as a function of the threshold K.
 
     Parameters
     ----------
@@ -391,7 +392,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
     columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (further or {}).values())]
     if len(columns) > 1:
-        # a row without other numbers cannot be recognised as a repetition
+        # a row in which all other numbers are missing cannot be recognised as a repetition
         has_values = np.any([np.isfinite(c) for c in columns[1:]], axis=0)
         fresh = known & (_changes(columns) | ~has_values)
     else:

@@ -1,4 +1,4 @@
-"""Forecasts of the rank that a receiver reports, and its decision, learned from flights.
+"""Forecasts of the rank that a receiver reports, and decisions from these forecasts, learned from flights.
 
 A forecast contains a probability for each rank. A forecast is scored by the log score, which is a proper score, and
 compared with the constant forecast (the histogram of the training flights). The rank that is decided from the
@@ -74,7 +74,7 @@ def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
 
 def constant_forecast(rank: ArrayLike) -> FloatArray:
-    """Return the histogram of training ranks (MAX_RANK,). One sample is added per rank: no rank is impossible."""
+    """Return the histogram of training ranks (MAX_RANK,). One sample is added per rank, so no share is 0."""
     values = unmasked(rank)
     count = np.bincount(values[values >= 1].astype(np.int64), minlength=MAX_RANK + 1)[1:] + 1.0
     return np.asarray(count / count.sum())
@@ -377,7 +377,7 @@ def _softmax(score: FloatArray) -> FloatArray:
 
 
 def _over_ranks(operation: np.ufunc, values: FloatArray) -> FloatArray:
-    """Return ``operation.reduce`` over the last axis. It has few elements, and a loop over them is ten times faster."""
+    """Return ``operation.reduce`` over the last axis. A loop over its few elements is ten times faster."""
     return np.asarray(reduce(operation, np.moveaxis(values, -1, 0)))
 
 

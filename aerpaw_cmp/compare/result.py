@@ -108,7 +108,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelLevel:
-    """Another simulation of the same samples: level (n,) [dBm], and the best offset for it."""
+    """Another simulation of the same samples: its level (n,) [dBm], and the best offset for this level."""
 
     level_dbm: FloatArray
     offset_db: float
@@ -416,7 +416,7 @@ class FlightVerdict:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """The results of one flight. A field is empty if the flight does not have such logs.
+    """The results of one flight. A field is empty if the flight does not have the logs that the field requires.
 
     ``models`` has one row per model over all channels, ``ladder`` one row per model, tower and channel. Both tables are
     empty if no models were compared.

@@ -1,22 +1,23 @@
-"""Intervals of correlated samples, and passes over the same positions.
+"""Confidence intervals for correlated samples, and comparison of passes over the same positions.
 
 Neighbouring samples of a flight are correlated, and a single flight hardly determines the correlation time. Intervals
-of a mean, a power and a ratio of powers therefore average over many possible correlations. The sequence is described by
-its slowest cosine terms (Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.00868.x): for a given correlation, they
-are normal with a known covariance. Correlation times range from zero to three times the flight. The correlation
-functions are exponential, with and without white noise, or smooth (Matern 3/2). Correlations over position follow the
-track. Each correlation is weighted by its likelihood and by a prior weight, chosen so that 95 % intervals have
-sufficient coverage for every correlation. Because the weights alone would make some intervals too wide, the draws are
-also widened or narrowed, depending on which correlations the sequence supports. Weights and widening factors were found
-by simulation (``benchmarks/interval_weights.py``).
+of a mean, a power and a ratio of powers therefore average over many possible correlations. A sequence of samples is
+described by its slowest cosine terms (Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.00868.x): for a given
+correlation, these terms are normally distributed with a known covariance. The assumed correlation times range from zero
+to three times the duration of the flight. The correlation functions over time are exponential, with and without white
+noise, or smooth (Matern 3/2). Correlations over position depend on the distance between two positions of the track.
+Each correlation is weighted by its likelihood and by a prior weight, chosen so that 95 % intervals have sufficient
+coverage for every correlation. Because the weights alone would make some intervals too wide, the random draws that form
+an interval are also widened or narrowed, depending on which correlations the sequence supports. Weights and widening
+factors were found by simulation (``benchmarks/interval_weights.py``).
 
 Statistics of ranks and of paired models are means of contributions of the samples, so their intervals are computed in
-the same way. Comparisons over all channels of a flight also learn the correlation from each channel
+the same way. Comparisons over all channels of a flight also estimate the correlation from each single channel
 (:class:`Channels`).
 
-Passes over the same positions are compared for every pair of flights: 199 000 pairs for 200 flights with ten links. The
-positions of a flight are therefore put into one k-d tree, pairs of flights whose bounding boxes do not overlap are not
-searched, and links that were sampled together share one search.
+Passes over the same positions are compared for every pair of flights. For 200 flights with ten links each, these are
+199 000 pairs of passes. The positions of a flight are therefore put into one k-d tree, pairs of flights whose bounding
+boxes do not overlap are not searched, and links that were sampled at the same positions share one search.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, Printed, unmasked, wrap_degrees
 
-# Number of cosine terms that determine the correlation of a long sequence. Faster terms are used only for the power.
-# Shorter sequences use the largest possible of a few numbers, because each number needs its own table.
+# Number of cosine terms that determine the correlation of a long sequence. Faster terms are used only for the power. A
+# shorter sequence uses the largest of a few smaller numbers that its length allows, because each number of terms needs
+# its own table.
 TERMS = 48
 _FEWER = np.array([9, 12, 16, 24, 34, TERMS])
 
@@ -46,7 +48,7 @@ FEWEST = 20
 # Length of the sequence divided by its correlation length (exp(-rate) is the correlation of the two ends).
 RATES = np.geomspace(0.3, 500.0, 18)
 
-# Shares of white noise in the slowest fluctuations.
+# Shares of white noise that are mixed with an exponential correlation, relative to the power of its slowest terms.
 WHITE_SHARES = (0.0, 2e-3, 3e-2)
 
 # White noise that is added to the terms of a smooth correlation, which fall with the fourth power of their order.
@@ -67,10 +69,10 @@ PLACE_WHITE = 0.002 * 2.0 ** np.arange(9)
 PLACE_FADING = (0.1, 0.25, 0.5, 0.75)
 _FADING_RATE = 40.0
 
-# By kind: weight of a correlation over position relative to the mean weight of a correlation over time, and length
-# above which the weight falls as 1 / length. The cosine terms hardly distinguish such lengths, but the mean and the
-# power of a test depend on them. The values were found by simulation. Differences of squares have half the correlation
-# length of errors.
+# For each kind of interval, the weight of a correlation over position relative to the mean weight of a correlation over
+# time, and the correlation length above which this weight falls as 1 / length. The cosine terms hardly distinguish such
+# long correlations, but the intervals of means and powers depend on them. The values were found by simulation.
+# Differences of squares have half the correlation length of errors.
 _PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.12, 0.2), "influence": (0.07, 1.0)}
 
 # Largest number of positions from which the correlations of a track are computed.
@@ -80,8 +82,8 @@ _THINNED = 400
 # centre of the track is below this [m]: the logged positions of a hover are noise.
 _UNPLACED, _HOVER_M = 0.1, 15.0
 
-# Part of the slow fluctuations of pooled channels that is white or ten times faster, because the correlations of
-# channels differ.
+# Share of the second part in the two-part correlations of pooled channels. The second part is white or ten times faster
+# than the first part, because the correlations of the channels differ.
 _SECOND_PART = 0.3
 
 # Smallest rate of a correlation with white noise that pooled channels can reveal. At smaller rates, no term would
@@ -93,14 +95,14 @@ _VISIBLE = 6.0
 # correlation.
 _BINS, _SUM_OF_POWERS = 1024, 0.3
 
-# File with logarithms of the weights in tenths, by kind, form (exponential with each white share, then smooth) and
-# rate, and with the widening of the draws in hundredths, per weighted share of each correlation and per unweighted
-# share.
+# File with the logarithms of the prior weights, in tenths, by kind, form (exponential with each white share, then
+# smooth) and rate. It also contains the factors that widen the draws, in hundredths: one for the share of each
+# correlation in the weighted likelihood, and one for its share in the unweighted likelihood.
 _TABLES = Path(__file__).with_name("memory_weights.json")
 
-# Factor from the standard deviation of the log power that the fourth moment suggests to the upward standard deviation
-# that is used. It was found by simulation with Student's t of four degrees of freedom. Most sequences from a process
-# with heavy tails contain fewer large errors than the process.
+# Factor by which the standard deviation of the log power, estimated from the fourth moment, is multiplied for upward
+# deviations. It was found by simulation with Student's t of four degrees of freedom. Most sequences from a process with
+# heavy tails contain too few of its large errors.
 CALM = 1.8
 
 # Number of parts of a flight whose powers are compared, the multiple of the median power above which a part is loud
@@ -109,8 +111,8 @@ CALM = 1.8
 # 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
-# Smallest widening factor. An interval with this factor contains 80 % of the draws. Without this limit, the factor
-# could reach 0 for an unusual mixture of correlations.
+# Smallest widening factor. With this factor, the 95 % interval consists of the central 80 % of the unchanged draws.
+# Without this limit, the factor could reach 0 for an unusual mixture of correlations.
 _LEAST_STRETCH = 0.6
 
 # Draws come in pairs of opposite sign, so that swapping two models reverses an interval exactly.
@@ -169,14 +171,14 @@ def time_correlations(terms: int = TERMS) -> CorrelationSet:
 
 @cache
 def _two_parts(terms: int) -> CorrelationSet:
-    """Return exponential correlations at all :data:`RATES` with a second part: white, then ten times faster."""
+    """Return exponential correlations at all :data:`RATES`, with a second part that is first white, then faster."""
     slow, fast = ([0.5 * by * rate * _exponential(by * rate, terms).real for rate in RATES] for by in (1.0, 10.0))
     both = [*zip(slow, [np.eye(terms + 1)] * len(RATES), strict=True), *zip(slow, fast, strict=True)]
     return CorrelationSet.of(np.array([(1.0 - _SECOND_PART) * first + _SECOND_PART * other for first, other in both]))
 
 
 def place_correlations(place_m: Track, terms: int = TERMS, centred: bool = False) -> CorrelationSet | None:
-    """Return the distributions for errors that are correlated over position.
+    """Return the normal distributions of mean and cosine terms for errors that are correlated over position.
 
     Parameters
     ----------
@@ -186,7 +188,8 @@ def place_correlations(place_m: Track, terms: int = TERMS, centred: bool = False
         Number of cosine terms.
     centred : bool
         True for differences of the squares of errors whose mean was subtracted. Such errors are anticorrelated at large
-        distances, so their squares are correlated everywhere. This changes the mean and no cosine term.
+        distances, so their squares are correlated everywhere. This affects the mean of the sequence, but none of its
+        cosine terms.
 
     Returns
     -------
@@ -207,7 +210,7 @@ def place_correlations(place_m: Track, terms: int = TERMS, centred: bool = False
     return _place_correlations(place_m[at].tobytes(), ((at + 0.5) / len(place_m)).tobytes(), terms, centred)
 
 
-# Channels and models of a flight have the same track. Each cached result takes 4 MB.
+# Cache the result, because the channels and models of a flight have the same track. Each cached result takes 4 MB.
 @lru_cache(maxsize=8)
 def _place_correlations(positions: bytes, instants: bytes, terms: int, centred: bool) -> CorrelationSet:
     place, instant = np.frombuffer(positions).reshape(-1, 3), np.frombuffer(instants)
@@ -267,14 +270,21 @@ def only_time(place_m: Track) -> str:
 
 
 def _smooth(rate: float, terms: int) -> FloatArray:
-    """Return the covariance for (1 + rate |s - t|) exp(-rate |s - t|), from the derivative of :func:`_exponential`."""
-    step = 1e-20  # along the imaginary axis, which is exact to rounding
+    """Return the covariance, as in :func:`_exponential`, for a smooth process.
+
+    The process has the covariance (1 + rate |s - t|) exp(-rate |s - t|). The result follows from the derivative of
+    :func:`_exponential` with respect to the rate.
+    """
+    step = 1e-20  # a step along the imaginary axis: the derivative is exact to rounding
     covariance = _exponential(complex(rate, rate * step), terms)
     return np.asarray(covariance.real - covariance.imag / step)
 
 
 def _exponential(rate: complex, terms: int) -> ComplexArray:
-    """Return the covariance (terms + 1, terms + 1) of the cosine terms of exp(-rate |s - t|) on the unit interval."""
+    """Return the covariance (terms + 1, terms + 1) of the cosine coefficients of a process on the unit interval.
+
+    The process has the covariance exp(-rate |s - t|).
+    """
     order = np.arange(terms + 1)
     sign = np.where(order % 2 == 0, 1.0, -1.0)
     pole = rate**2 + (np.pi * order) ** 2
@@ -296,7 +306,11 @@ def weights(kind: Kind) -> FloatArray:
 
 @cache
 def stretches(kind: Kind) -> FloatArray:
-    """Return factors (2, m) that widen the draws: for the weighted and the unweighted share of each correlation."""
+    """Return factors (2, m) that widen the draws.
+
+    The first row applies to the share of each correlation in the weighted likelihood, the second row to its share in
+    the unweighted likelihood.
+    """
     if kind in ("ratio", "influence"):  # for these kinds, the weights are enough to limit false verdicts to 5 %
         return np.repeat([[1.0], [0.0]], len(weights(kind)), axis=1)
     return 0.01 * _table(f"{kind} stretch").reshape(2, -1)
@@ -365,11 +379,11 @@ class Channels:
 
         The terms of the sequence are the sum of the terms of its channels. If channels are independent, the outer
         products of the terms of each channel add up to the covariance of the sum on average, even if the channels have
-        different correlations, powers or numbers of samples. The likelihood of a pooled sequence then counts like the
-        likelihood of several sequences, whose number follows from the powers and correlations of the channels. However,
-        if channels have common fading and separate noise, their sum is correlated in another way than each channel.
-        Therefore the weights are a mixture of these likelihoods and of the weights for a single sequence. The
-        likelihoods have a small weight in this mixture if the power of the sum is not the sum of the powers.
+        different correlations, powers or numbers of samples. The likelihood of the channels then counts like that of
+        several sequences, whose number follows from the powers and correlations of the channels. However, if channels
+        have common fading and separate noise, their sum is correlated in another way than each channel. Therefore the
+        weights are a mixture of these likelihoods and of the weights for a single sequence. The likelihoods of the
+        channels have a small weight if the power of the sum is not the sum of the powers.
         """
         from scipy.fft import dct
 
@@ -399,7 +413,7 @@ class Channels:
 
 
 def likelihoods(slow: FloatArray, parts: Sequence[CorrelationSet] = ()) -> tuple[FloatArray, FloatArray]:
-    """Return the likelihood (..., m) of each correlation at any scale, and the whitened sum of squares."""
+    """Return the likelihood (..., m) of each correlation at an unknown scale, and the whitened sum of squares."""
     parts = parts or (time_correlations(slow.shape[-1]),)
     square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
     log_det = np.concatenate([part.log_det for part in parts])
@@ -488,10 +502,10 @@ def mean_draws(
 
 
 def heavy_tails(values: FloatArray) -> float:
-    """Return the standard deviation of the logarithm of the mean square for heavy tails (see :data:`CALM`).
+    """Return the standard deviation that heavy tails add to the logarithm of the mean square, before :data:`CALM`.
 
-    The tails are estimated from the innovations of a first-order autoregression, because every sample is a sum over
-    many innovations.
+    The tails are estimated from the innovations of a first-order autoregression. A sample is a sum of many innovations,
+    and therefore has lighter tails than an innovation.
     """
     away, n = values - values.mean(), len(values) - 1
     keep = min(float(away[1:] @ away[:-1]) / float(away @ away), 1.0)
@@ -499,8 +513,8 @@ def heavy_tails(values: FloatArray) -> float:
     square = max((np.square(e) for e in both), key=lambda e: float(e @ e) / max(float(e.mean()) ** 2, 1e-300))
     # Subtract part of the standard error, because a short normal sequence can show heavy tails by chance.
     excess = float(square @ square) / n / max(float(square.mean()) ** 2, 1e-300) - 3.0 - np.sqrt(6.0 / n)
-    # A long sequence contains rare large errors that a short sequence lacks. The power was found by simulation, like
-    # CALM.
+    # A long sequence contains rare large errors that a short sequence lacks. The exponent 0.1 was found by simulation,
+    # like CALM.
     return float(np.sqrt(max(excess, 0.0) / n) * (300.0 / n) ** 0.1)
 
 
@@ -511,8 +525,8 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
     -------
     share, ratio : float
         Share of the samples in the loud parts, and the mean square of these samples divided by the mean square of all
-        others. 0 and 1 if the sequence is steady. At least two parts must be loud by two criteria: the mean square of
-        the errors, and the mean square of the innovations of a second-order autoregression, which are hardly
+        other samples. 0 and 1 if the sequence is steady. At least two parts must be loud by two criteria: the mean
+        square of the errors, and the mean square of the innovations of a second-order autoregression, which are hardly
         correlated.
     """
     away = values - values.mean()
@@ -550,13 +564,14 @@ def power_draws(values: FloatArray, place_m: Track = None) -> FloatArray:
     known = weighted_correlations("power", len(terms.slow), place_m)
     index, scale, stretch = _picked(terms.slow, known)
     *_, normal, second_normal = _random(len(terms.slow))
-    # errors over position repeat when the flight returns, so their power has fewer independent squares
+    # errors that depend on the position repeat when the UAV returns to it, so their power has fewer independent squares
     placed = np.minimum(scale * known.joined("beyond")[index] / max(terms.fast_power, 1e-300), 1.0)
     third = 2.0 / 9.0 * np.maximum(1.0 / terms.fast_freedom, placed**2 / known.joined("freedom")[index])
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     share, ratio = loud_part(values)
-    # reduce the effect of heavy tails, because a loud part, which is included below, also makes tails heavy
+    # reduce the effect of heavy tails if there is a loud part: it also makes the tails heavy, and its own effect is
+    # added below
     heavy = (0.7 if share else 1.0) * heavy_tails(values)
     tails = np.exp(heavy * np.where(normal > 0.0, CALM, 1.0) * normal)
     drawn = (scale * known.joined("power")[index] + fast) * tails
@@ -672,7 +687,10 @@ def _notes(values: FloatArray, place_m: Track) -> Iterator[str]:
 
 
 def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, place_m: Track) -> Interval:
-    """Return the interval of the correlation for a fixed route: slope and residual of the measurement are random."""
+    """Return the interval of the correlation.
+
+    The route is fixed. The slope and the residual of the measurement are random.
+    """
     s, m = simulated_db - simulated_db.mean(), measured_db - measured_db.mean()
     spread = float(s @ s) / len(s)
     if spread == 0.0 or not m.any():
@@ -717,9 +735,9 @@ def influence_interval(
 
     Notes
     -----
-    This is the interval of the mean of ``influence``, with the weights of paired differences. On simulated ranks it
-    covers the true value as often as with the weights of offsets. At 1000 samples and 150 m it has 1.3 times the width
-    for a known correlation, instead of 1.8 times.
+    This is the interval of the mean of ``influence``, with the weights for paired differences. On simulated ranks, it
+    covers the true value as often as an interval with the weights for offsets. With 1000 samples and a correlation
+    length of 150 m, its width is 1.3 times the width for a known correlation, instead of 1.8 times.
     """
     if len(influence) < FEWEST or not np.isfinite(estimate):
         return NO_INTERVAL
@@ -742,9 +760,9 @@ def spread_interval(values: FloatArray, place_m: Track = None) -> Interval:
 def rmse_interval(residual: FloatArray, rmse: float, place_m: Track = None) -> Interval:
     """Return the 95 % interval of the root mean square of residuals (n,) in time order, whose value is ``rmse``.
 
-    The residuals have a mean if the offset is on a grid, at the edge of its range or fitted with a floor. The mean
-    shifts both ends of the interval as it shifts the RMSE. Positions ``place_m`` (n, 3) [m] are used as by
-    :func:`mean_draws`.
+    The mean of the residuals is not 0 if the offset was rounded to a grid, is at the edge of its search range or was
+    fitted with a floor. The mean then enlarges both ends of the interval as it enlarges the RMSE. Positions ``place_m``
+    (n, 3) [m] are used as by :func:`mean_draws`.
     """
     if len(residual) < FEWEST:
         return NO_INTERVAL
@@ -753,7 +771,7 @@ def rmse_interval(residual: FloatArray, rmse: float, place_m: Track = None) -> I
 
 
 def _around(estimate: float, drawn: FloatArray) -> Interval:
-    """Return the 95 % interval of draws, extended to the estimate."""
+    """Return the 95 % interval of draws, extended so that it contains the estimate."""
     if not np.isfinite(estimate) or not np.isfinite(drawn).any():
         return NO_INTERVAL
     low, high = np.nanquantile(drawn, [0.025, 0.975])
@@ -765,22 +783,23 @@ def middle_span(values: FloatArray) -> float:
     return float(np.ptp(np.percentile(values, (10, 90))))
 
 
-# A level is flat if it varies less than this share of the predicted levels: a noise floor, or an input without signal.
+# A measured level is flat if it varies by less than this share of the variation of the predicted levels, as at a noise
+# floor or at an input without a signal.
 _FLAT = 0.2
 
 
 def is_flat(measured_db: FloatArray, predicted_db: Iterable[FloatArray]) -> bool:
-    """Check whether a level (n,), n > 0, hardly varies although every predicted level (n,) varies [dB]."""
+    """Check whether a measured level (n,), n > 0, varies much less than every predicted level (n,) [dB]."""
     return middle_span(measured_db) < _FLAT * min(map(middle_span, predicted_db))
 
 
 def is_stuck(level_db: FloatArray) -> bool:
-    """Check whether a log has at most two different levels (n,), which show nothing about a link."""
+    """Check whether a log has at most two different levels (n,), which do not contain information about a link."""
     return len(np.unique(level_db[np.isfinite(level_db)])) <= 2
 
 
 def correlation(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the Pearson correlation over pairs without NaN. NaN for fewer than three pairs or a constant side."""
+    """Return the Pearson correlation over pairs without NaN, or NaN for fewer than three pairs or a constant input."""
     a, b = unmasked(first), unmasked(second)
     ok = np.isfinite(a) & np.isfinite(b)
     if ok.sum() < 3 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
@@ -802,10 +821,11 @@ class PairedDifference:
     difference_db : float
         ``rmse_db - other_rmse_db`` [dB], negative if the first model is better.
     difference_ci95_db : (low, high)
-        95 % interval of the difference [dB]. NaN if there is no interval. Also NaN if it contains 0 and would make an
-        error negative, because the flight is then too short for its correlation.
+        95 % interval of the difference [dB]. NaN if there is no interval. Also NaN if it contains 0 and is so wide that
+        one of the two RMSEs would be negative at one of its ends: the flight is then too short compared with the
+        correlation time of its errors.
     standard_error_db : float
-        Half of the central 68 % interval of ``difference_db`` [dB], NaN if there is none.
+        Half of the width of the central 68 % interval of ``difference_db`` [dB], NaN if there is no interval.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
         Difference of the mean square errors and its interval [dB^2].
     p_value : float
@@ -875,8 +895,8 @@ def paired_difference(
     Let d be the difference of the two predictions, which the route determines, and b the coefficient of a regression of
     the error on d. The difference of the mean square errors is (2 b - 1) times the mean square of d. The random part of
     each sample is d times the residual of that regression (Harvey, Leybourne and Newbold 1998,
-    doi:10.1080/07350015.1998.10524759). In each segment, b comes from the other segments, so that a single segment
-    cannot determine b.
+    doi:10.1080/07350015.1998.10524759). In each segment of the flight, b is fitted to the other segments, so that a
+    single segment cannot determine b.
 
     Examples
     --------
@@ -924,7 +944,7 @@ def undecided(first: FloatArray, second: FloatArray) -> FloatArray:
     apart = first - second
     segment = np.arange(len(apart)) * _SEGMENTS // len(apart)
     products, squares = (np.bincount(segment, values, _SEGMENTS) for values in (first * apart, apart * apart))
-    # add a small weight towards equal models, for a flight in which one segment contains all of the difference
+    # add a small weight towards equal models, in case one segment of a flight contains all of the difference
     even = 1e-3 * squares.sum() + 1e-300
     share = (products.sum() - products + 0.5 * even) / (squares.sum() - squares + even)
     return np.asarray(2.0 * (first - share[segment] * apart) * apart)
@@ -951,7 +971,8 @@ def pooled_difference(
     -------
     PairedDifference
         Comparison of the root mean square errors over all samples. Samples of all channels are in time order, so that
-        common fading of the channels counts once. The channels also show the correlation (:class:`Channels`).
+        common fading of the channels counts once. The correlation is also estimated from the single channels
+        (:class:`Channels`).
     """
     parts = []
     for at, (time, error, other) in enumerate(channels):
@@ -972,7 +993,7 @@ def pooled_difference(
 def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | None = None) -> list[PairedDifference]:
     """Correct the verdicts of several channels for their number (Holm 1979).
 
-    With a probability of 95 %, all verdicts that remain are right.
+    With a probability of 95 %, all remaining verdicts "better" and "worse" are right.
 
     Channels with the same ``measured`` levels count once.
     """
@@ -1052,7 +1073,7 @@ class Visit:
 
 
 def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
-    """Return indices of pairs: each sample of one pass with the nearest sample of the other within a radius [m]."""
+    """Return indices of pairs: a sample of one pass, and the nearest sample of the other pass within a radius [m]."""
     known = [np.isfinite(v.position_m).all(axis=1) & np.isfinite(v.value) for v in (first, second)]
     mine, theirs = (_Places(v.position_m, v.heading_deg, k) for v, k in zip((first, second), known, strict=True))
     return mine.partners(theirs, radius_m, _HEADING_WITHIN_DEG)
@@ -1060,7 +1081,7 @@ def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pass:
-    """One pass: a flight on one link.
+    """The samples of one link on one flight.
 
     Parameters
     ----------
@@ -1129,7 +1150,10 @@ class PassPair:
 
 
 class _Places:
-    """The samples that ``good`` (n,) selects, with k-d tree and box. ``where`` are their indices in the pass."""
+    """The samples of a pass that the mask ``good`` (n,) selects, with their k-d tree and bounding box.
+
+    ``where`` contains the indices of the samples in the pass.
+    """
 
     def __init__(self, position_m: FloatArray, heading_deg: FloatArray | None, good: BoolArray) -> None:
         self.where = np.flatnonzero(good)
@@ -1146,7 +1170,8 @@ class _Places:
 
     def partners(self, other: _Places, radius_m: float, within_deg: float | None) -> tuple[IntArray, IntArray]:
         """Return pairs of indices: samples of this pass, and the nearest of the other pass at a similar heading."""
-        # only samples in the box of the other pass can pair, which excludes most flights of a campaign
+        # only samples in the bounding box of the other pass can have a partner, which excludes most flights of a
+        # campaign
         near = np.flatnonzero(
             ((self.position_m >= other.low - radius_m) & (self.position_m <= other.high + radius_m)).all(axis=1)
         )
@@ -1233,9 +1258,9 @@ def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Place
 
 
 def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> _Places:
-    """Return the positions of some samples. Links that were sampled together share one object."""
+    """Return the samples that ``good`` selects. Links that were sampled at the same positions share one object."""
     columns = (good, flown.position_m, *([] if flown.heading_deg is None else [flown.heading_deg]))
-    # compare contents, because links that were sampled together have equal positions in different arrays
+    # compare contents, because links that were sampled at the same positions have equal values in different arrays
     key = hashlib.sha256(b"".join(column.tobytes() for column in columns)).digest()
     return places.setdefault(key, _Places(flown.position_m, flown.heading_deg, good))
 

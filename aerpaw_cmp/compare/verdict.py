@@ -47,9 +47,9 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return channels with an offset and enough samples, without copies.
+    """Return the channels without copies that have enough samples and an offset inside its search range.
 
-    If any has a signal, omit those without a signal.
+    If any of these channels has a signal, channels without a signal are omitted.
     """
     some = [p for p in without_copies(panels) if not p.score.at_edge]
     enough = [p for p in some if p.score.n >= statistics.FEWEST and math.isfinite(p.score.rmse_db)]
@@ -66,7 +66,7 @@ _DEAD_DB = 1.0
 
 
 def is_dead(panel: RssResult) -> bool:
-    """Check whether a channel has no signal: 80 % of its levels are within 1 dB, unlike the predictions."""
+    """Check whether a channel has no signal: 80 % of its levels are within 1 dB, although the predictions vary."""
     known = panel.posed & np.isfinite(panel.measured_db) & np.isfinite(panel.simulated_dbm)
     if not known.any():
         return False
@@ -77,14 +77,14 @@ def is_dead(panel: RssResult) -> bool:
 
 
 def is_one_place(panels: Iterable[RssResult]) -> bool:
-    """Check whether no model predicts a change of 1 dB, as in a hover. Then all models fit like a constant."""
+    """Check whether no model predicts a change of 1 dB, as in a hover. All models then fit like a constant."""
     every = [[panel.simulated_dbm, *(b.level_dbm for b in panel.baselines.values())] for panel in scored(panels)]
     levels = [level[np.isfinite(level)] for models in every for level in models if np.isfinite(level).any()]
     return bool(levels) and max(map(statistics.middle_span, levels)) < _DEAD_DB
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
-    """Return the pooled RMSE [dB] of each baseline that all of these channels have."""
+    """Return the pooled RMSE [dB] of each baseline that was computed for all of these channels."""
     errors = {}
     for name in panels[0].baselines if panels else ():
         known = [panel.baselines[name].rmse_db for panel in panels if name in panel.baselines]
@@ -94,7 +94,7 @@ def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
 
 
 def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
-    """Return the RMSE over all samples of several series, each after its own offset [dB]."""
+    """Return the RMSE over all samples of several channels, each after subtraction of its own offset [dB]."""
     weight = np.asarray(n, dtype=np.float64)
     return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
 
@@ -245,9 +245,10 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
 
     Notes
     -----
-    Student's t for n flights. From :data:`_MANY_FLIGHTS` flights on, n is the number of independent flights
-    n (1 - r) / (1 + r), because consecutive flights can correlate. r is the correlation of consecutive flights,
-    corrected for its bias of -(1 + 3 r) / n (Kendall 1954, doi:10.2307/2332720); a negative r counts as 0.
+    The interval uses Student's t for n flights. From :data:`_MANY_FLIGHTS` flights on, n is replaced by the number of
+    independent flights n (1 - r) / (1 + r), because consecutive flights can correlate. r is the correlation of
+    consecutive flights, corrected for its bias of -(1 + 3 r) / n (Kendall 1954, doi:10.2307/2332720); a negative r
+    counts as 0.
     """
     from scipy.special import stdtrit  # importing scipy.stats would take 0.2 s for one quantile
 
@@ -290,16 +291,16 @@ NONE = "none"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """A verdict, such as the first sentences of a page state.
+    """A verdict, as the first sentences of a page state it.
 
     Parameters
     ----------
     cause : str
         Key of the sentence and of the next step, ``none`` if no cause is significant.
     effect : float
-        Effect in the unit of the cause (dB, a ratio, a share), NaN if there is none.
+        Effect in the unit of the cause (dB, a ratio, a share), NaN if there is no effect.
     interval : (low, high)
-        95 % interval of the effect, NaN if there is none.
+        95 % interval of the effect, NaN if there is no interval.
     where : str
         Flight, link, baseline or time that the sentence names.
     """
@@ -375,7 +376,7 @@ def _shifts(
 
 
 def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, statistics.Interval]]:
-    """Compare each value with all others."""
+    """Compare each value with all other values."""
     for i in range(len(values)):
         yield i, *_split(values, np.arange(len(values)) == i)
 
@@ -433,12 +434,12 @@ def _means(errors_db: Iterable[tuple[str, float]]) -> dict[str, float]:
 
 
 def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
-    """Check whether the learned gain rotates with the aircraft, by comparison with wrong frames (:func:`by_flight`).
+    """Check whether the learned gain rotates with the aircraft, by comparing the body frame with wrong frames.
 
     Parameters
     ----------
     against : sequence of Verdict
-        Verdict of the body frame against each wrong frame.
+        Verdict of the body frame against each wrong frame, from :func:`by_flight`.
 
     Returns
     -------
@@ -570,10 +571,10 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     return Verdict(cause=cause, effect=worst.covered, where=f"{worst.height_m:g} m")
 
 
-# Number of latest nights that are tested for a step, and nominal probability of a false step per night over all nodes.
-# Seven nights show smaller steps than one night. The true probability is 1 % per night, even if consecutive nights
-# correlate by 0.7, and half of that if they correlate by 0.5 (``python -m tests.compare.test_steps 500``). It exceeds
-# the nominal probability, because a robust fit with missing links has longer tails than Student's t.
+# For each number of latest nights that are tested for a step, the nominal probability of a false step per night over
+# all nodes. A mean over seven nights shows smaller steps than one night. The true probability is 1 % per night, even if
+# consecutive nights correlate by 0.7, and half of that if they correlate by 0.5 (``python -m tests.compare.test_steps
+# 500``). It exceeds the nominal probability, because a robust fit with missing links has longer tails than Student's t.
 _CHANCES = {1: 0.0025, 7: 0.0005}
 
 # Smallest number of nights that determine the standard deviation well enough to test for a step.
@@ -602,8 +603,8 @@ class Step:
 class NodeOffset:
     """The offset of one transmitter or receiver over the nights of a campaign [dB], relative to its median.
 
-    ``sd_db`` is the standard deviation between steps, and ``smallest_db`` is the step that is found in the same night
-    with a probability of 90 %. Both numbers are NaN if there are too few nights.
+    ``sd_db`` is the standard deviation between steps, and ``smallest_db`` is the smallest step that is detected, with
+    90 % probability, in the night in which it occurs. Both numbers are NaN if there are too few nights.
     """
 
     node: str
@@ -712,7 +713,7 @@ class _Segment:
         return self.square + own, self.freedom + len(self.values) - 1
 
     def inflation(self) -> float:
-        """Return the ratio of two variances of the mean over nights: of consecutive nights, and of independent nights.
+        """Return the variance of the mean over consecutive nights, divided by that over independent nights.
 
         The correlation is increased by its standard error, because its estimate can be too small by chance.
         """
@@ -777,7 +778,8 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
     night : sequence of str
     offsets : NightOffsets
     nodes : int
-        Number of nodes that are tested together. There is one false step in a hundred nights over all nodes together.
+        Number of nodes that are tested together. On average, there is one false step in a hundred nights over all nodes
+        together.
 
     Returns
     -------
@@ -885,7 +887,7 @@ class LevelDifference:
 class RankDifference:
     """The difference in the rank of one tower at one K.
 
-    ``n_changed`` simulated and ``n_reported_changed`` reported ranks of common samples differ.
+    On common samples, ``n_changed`` simulated and ``n_reported_changed`` reported ranks differ between the reports.
     """
 
     tower: str

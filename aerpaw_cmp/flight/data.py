@@ -307,7 +307,7 @@ def ground_nodes(
                 warnings += [f"towers.{name}: {text}" for text in remarks]
         if node.region90_m is not None and warnings is not None:
             warnings.append(
-                f"towers.{name}: the position was estimated from levels (90 % region: {node.region90_m:.0f} m), so a "
+                f"towers.{name}: the position was chosen by the levels (90 % region: {node.region90_m:.0f} m), so a "
                 "part of the error can be an error of this position: enter the measured position without region90_m"
             )
         east, north = site.frame.to_local(np.array([latitude]), np.array([longitude]))

@@ -386,7 +386,7 @@ class GroundNode(StrictModel):
     height : {"ground", "logged"}
         ``ground``: the antenna is ``antenna_height_m`` above the ground. ``logged``: at the height of the track.
     region90_m : float, optional
-        Radius of the 90 % region of a position that was estimated from levels [m]. Remove it for a measured position.
+        Radius of the 90 % region of a position that was chosen by the levels [m]. Remove it for a measured position.
     """
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None

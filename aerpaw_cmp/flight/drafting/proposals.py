@@ -256,7 +256,9 @@ class NodeFinder:
             undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]
             also = "".join(f" or line {tie.line}" for tie in undecided)
             about = f"line {place.line} of {place.file}{also}: is the node there?"
-            at_list = round(place.latitude_deg, 7), round(place.longitude_deg, 7), 1.5
+            # the region contains all likely lines
+            apart_m = [1 + int(np.linalg.norm(self._local(tie) - self._local(place))) for tie in undecided]
+            at_list = round(place.latitude_deg, 7), round(place.longitude_deg, 7), 1.5, *sorted(apart_m)[-1:]
             return _node(self._local(place), at_list, about, nodes)
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:

@@ -196,9 +196,11 @@ KILL_EVERY = os.environ.get("AERPAW_CMP_KILL_EVERY", "0")
 KILLS = """
 import contextlib, os, shutil, sys
 from pathlib import Path
-import numpy as np, xarray, zarr
+# what the command loads on demand, or each fork would load it again
+import aerpaw_parsers, jinja2, matplotlib.backends.backend_svg, netCDF4, numpy as np, pandas, scipy.spatial, xarray, zarr
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.jobs import coverage_map
+from aerpaw_cmp.cli import app
+from aerpaw_cmp.jobs import coverage_map, paper_table, run
 
 words = ["--spacing", "480", "--tile-m", "1200", "--rss-altitude", "30", "--rank-altitude", "30", "--max-depth", "0"]
 command = ["map", "lake_wheeler", "-o", "out", "--no-study", "--foliage", "none", "-q", *words]

@@ -1,4 +1,4 @@
-"""Parts that all NetCDF files share, according to the CF conventions: units, reference systems, the file."""
+"""The parts that all NetCDF files share, according to the CF conventions: units, reference systems, writing."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def wgs84() -> dict[str, Any]:
 
 def flags(meanings: Sequence[str], dtype: type[np.integer[Any]] = np.int8, first: int = 0) -> dict[str, Any]:
     """Return the attributes of integer codes ``first``, ``first`` + 1, ... with these meanings."""
-    # replace characters that CF does not allow in a meaning, such as the spaces that separate meanings
+    # replace characters that CF does not allow in a meaning, such as spaces, which separate the meanings
     words = [re.sub(r"[^A-Za-z0-9_.+@-]", "_", text) or "_" for text in meanings]
     return {"flag_values": np.arange(first, first + len(words), dtype=dtype), "flag_meanings": " ".join(words)}
 
@@ -85,7 +85,9 @@ class Variable:
 
 
 class Dataset:
-    """The variables and attributes of a file, like ``xarray.Dataset``, but without its import, which takes a second.
+    """The variables and attributes of a file, like ``xarray.Dataset``.
+
+    A separate class, because importing xarray takes a second.
 
     Parameters
     ----------
@@ -153,7 +155,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
         if {*dims} & {*grows}:
             encoding["chunksizes"] = (64,) * len(dims) if values.dtype.kind == "S" else _chunk(dims, values, grows)
         made = book.createVariable(name, values.dtype, dims, fill_value=encoding.pop("_FillValue", None), **encoding)
-        # the values are already packed: do not let netCDF4 scale them again
+        # do not let netCDF4 scale the values, because they are already scaled as in the file
         made.set_auto_maskandscale(False)
         made.setncatts(attributes)
         made[...] = values
@@ -161,7 +163,10 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
 
 
 def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple[int, ...]:
-    """Return the shape of a chunk of about 1 MiB or less. Along all unlimited dimensions except the first, it is 1."""
+    """Return the shape of a chunk of about 1 MiB or less.
+
+    The length along each unlimited dimension except the first is 1.
+    """
     sizes = dict(zip(dims, values.shape, strict=True))
     fixed = math.prod(size for name, size in sizes.items() if name not in grows)
     step = max(1, min(sizes.get(grows[0], 1), (1 << 20) // max(values.dtype.itemsize * fixed, 1)))
@@ -170,19 +175,20 @@ def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple
 
 
 class GrowingNetcdf:
-    """A context that writes data sets to a NetCDF-4 file one after another, with only one of them in memory.
+    """A context that appends data sets to a NetCDF-4 file, with only one data set in memory.
 
     Parameters
     ----------
     path : Path
     grows : sequence of str
         Unlimited dimensions. Data sets are appended along the first of these. Along the other dimensions, shorter data
-        sets are filled with ``_FillValue``. A variable without the first dimension is overwritten by each data set.
+        sets are filled with ``_FillValue``. Each data set overwrites the variables that do not have the first of these
+        dimensions.
 
     Notes
     -----
-    A ``_FillValue`` other than NaN is used to fill the file, but the attribute is removed at the end. Otherwise readers
-    would replace valid values, such as a gain of 0 or a flag of -1, by NaN.
+    A ``_FillValue`` other than NaN fills the file, but its attribute is removed. Otherwise readers would replace valid
+    values that equal it, such as a gain of 0 or a flag of -1, by NaN.
     """
 
     def __init__(self, path: Path, grows: Sequence[str]) -> None:
@@ -240,7 +246,7 @@ class GrowingNetcdf:
 
 
 def _parts(data: Any) -> dict[str, Variable]:
-    """Return the variables in the form of a file: text as characters, complex numbers as two variables."""
+    """Return the variables as a file stores them: text as characters, complex numbers as two variables."""
     parts = {}
     for name, variable in data.variables.items():
         dims, values, about = variable.dims, np.asarray(variable.values), dict(variable.attrs)

@@ -1,4 +1,4 @@
-"""SHA-256 of the content of records, arrays and shapes, used as cache key.
+"""The SHA-256 of the content of records, arrays and shapes, used as a cache key.
 
 The module also reads the training logs that a learned file lists by their SHA-256 and their fingerprints (``marks``).
 
@@ -21,7 +21,7 @@ from shapely.geometry.base import BaseGeometry
 def content_digest(*values: Any) -> str:
     """Return the SHA-256, in hexadecimal, of values and their contents.
 
-    Objects of unknown types never have equal digests.
+    Objects of other types are digested by their ``repr``. If it contains their address, their digests are never equal.
     """
     digest = hashlib.sha256()
     for value in values:
@@ -34,14 +34,15 @@ def _feed(digest: Any, value: Any) -> None:
     if isinstance(value, np.ndarray) and value.dtype != object:
         digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif dataclasses.is_dataclass(value):
-        # fields excluded from comparison derive from the others, so equal records get the same digest
+        # skip fields that are excluded from comparison: they are derived from the other fields, so equal records get
+        # equal digests
         _feed(digest, [getattr(value, item.name) for item in dataclasses.fields(value) if item.compare])
     elif isinstance(value, BaseGeometry):
         digest.update(value.wkb)
     elif isinstance(value, Mapping):
         _feed(digest, list(value.items()))
     elif isinstance(value, (list, tuple, np.ndarray)):
-        # include the length, so that [[1], 2] and [[1, 2]] differ
+        # include the length, so that [[1], 2] and [[1, 2]] have different digests
         digest.update(f"[{len(value)}".encode())
         for item in value:
             _feed(digest, item)
@@ -55,7 +56,7 @@ KEY, MARKS = "trained_on", "marks"
 
 
 def _listed(text: str, key: str, entry: str) -> tuple[str, ...]:
-    """Return the entries after a key in YAML lists of either style, JSON arrays, and comments of tables."""
+    """Return the entries after a key in YAML lists (block or flow style), JSON arrays, and comments of tables."""
     lists = re.findall(key + rf"""["']?[ \t]*:[\s\["',-]*((?:{entry}[\s"',#-]*)+)""", text)
     return union(*(re.findall(entry, part) for part in lists))
 

@@ -9,8 +9,8 @@ class                   exit code  meaning
 :class:`OutputError`    3          an output could not be written
 ======================  =========  =====================================
 
-A message contains what was found, what was expected, the likely cause and the place.
-Any other exception that reaches a user is a bug in this package.
+A message contains what was found, what was expected, the likely cause, and the file and line. Any other exception that
+reaches a user is a bug in this package.
 
 Every message ends with the next step: the command to run or the line to edit.
 """
@@ -59,7 +59,7 @@ def printable(text: str) -> str:
 
 
 def typed(path: str | Path) -> str:
-    """Return a path as it is typed in a command line: in quotes if it contains spaces or special characters.
+    """Return a path as a user types it in a command line: in quotes if it contains spaces or special characters.
 
     Examples
     --------
@@ -148,7 +148,7 @@ class AerpawCmpError(Exception):
 
 @contextmanager
 def about_file(path: str | Path, line: int | None = None) -> Iterator[None]:
-    """Add this path, and the line if none is known, to errors from inside the block that do not name a file."""
+    """Add a path to errors from inside the block that do not name a file, and a line if the error has none."""
     try:
         yield
     except AerpawCmpError as error:
@@ -166,7 +166,8 @@ _IN_WORDS: dict[Any, str] = {
 }
 
 
-# An exception of these classes is a bug of this package, not an error in a file, if a line of this package raised it.
+# If a line of this package raises an exception of these classes, it is a bug of this package and not an error in a
+# file.
 _FAULTS = (TypeError, AttributeError, NameError, AssertionError, NotImplementedError, ImportError)
 
 
@@ -186,7 +187,7 @@ def parsing(
     expected, cause : str, optional
         Parts of the message for errors that the parser does not handle.
     any_shape : bool
-        Whether the block walks through JSON of an unchecked shape. If true, a TypeError is an error of the file,
+        True if the block reads JSON whose structure was not checked. A TypeError is then an error of the file,
         otherwise a bug.
 
     Yields
@@ -205,7 +206,7 @@ def parsing(
             raise
         words = "it has no" if isinstance(error, KeyError) else f"{type(error).__name__}:"
         words += f" {one_line(str(error)[:200])}"
-        # match the base class: UnicodeDecodeError is a UnicodeError
+        # use isinstance, because UnicodeDecodeError is a subclass of UnicodeError
         words = next((text for kind, text in _IN_WORDS.items() if isinstance(error, kind)), words)
         raise InputError(f"cannot be read ({words})", expected=expected, cause=cause, path=path) from error
 
@@ -214,7 +215,7 @@ def _is_raised_here(error: BaseException) -> bool:
     """Check whether a line of this package or of its readers raised an error, not a library that it called."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
-        # the last frame is where it was raised
+        # the last frame of a traceback is where the error was raised
         trace = trace.tb_next
     name = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
     return name.partition(".")[0] in ("aerpaw_cmp", "aerpaw_parsers")
@@ -234,7 +235,7 @@ def parsed(expected: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     return decorate
 
 
-# Python arguments whose name differs from the command-line option.
+# Command-line options and their Python arguments, if the names differ.
 _IN_PYTHON = {"--with": "learned", "--force": "force=True"}
 
 
@@ -251,8 +252,8 @@ def _as_columns(options: re.Match[str]) -> str:
 def from_python(public: _T) -> _T:
     """Decorate a public function or class, so that errors name arguments (``timezone=``), not options (``--timezone``).
 
-    An argument that an options record refuses is reported for the public function. Attributes that only ``fit`` creates
-    are reported as missing ``fit()``.
+    An argument that an options record refuses is reported for the public function. If an attribute is missing that only
+    ``fit()`` creates, the message says to call ``fit()`` first.
     """
     if isinstance(public, type):
         for name, method in vars(public).items():
@@ -315,13 +316,13 @@ class OutputError(AerpawCmpError):
 
 
 _SETTINGS = (".yaml", ".yml")
-# Commands whose numbers and names all come from a file.
+# Commands whose settings all come from a file.
 _OF_SETTINGS = [["report"], ["simulate"], ["calibrate"], ["campaign"]]
 _OF_LOGS = [["report"], ["explain"], ["calibrate"], ["campaign"], ["predict"], ["plan"]]
 
 
 def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
-    """Return the step that most likely fixes a failure of a command line. Empty if there is none.
+    """Return the step that most likely fixes a failure of a command line. Empty if no step is known.
 
     Parameters
     ----------
@@ -380,10 +381,10 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if extra := re.match(r"Got unexpected extra argument\S* \((.+)\)", error.found):
         return f"the same command without {one_line(extra[1])}"
     settings_files = [word for word in arguments if word.endswith(_SETTINGS)]
-    # a log without a time zone is not wrong: the key must be added to the settings
+    # if a log has no time zone, name the settings file, because the key must be added there
     in_file = place is None or "timezone:" in (error.expected or "")
     if in_file and settings_files and words[:1] in _OF_SETTINGS and "--" not in error.found:
-        # the message names the flights: of several files, the first is not necessarily wrong
+        # do not name the first of several files, because another may be wrong: the message already names the flights
         wrong = one_line(Path(settings_files[0]).name) if len(settings_files) == 1 else "the flight files"
         return f"fix {wrong} and run the same command"
     if words[:1] == ["tap"] and isinstance(error, InputError):
@@ -405,7 +406,7 @@ def _step_for(place: Path, error: AerpawCmpError, command: str, arguments: Seque
     if not place.is_file():
         return f"'ls -l {typed(place)}' shows what is there"
     if words[:1] == ["ingest"]:
-        # if the file is recognised, or the cause explains --map, the message already contains the next step
+        # return no step if the file is recognised or the cause explains --map: the message then contains the next step
         unknown = "no reader recognises" in error.found and "--map" not in (error.cause or "")
         return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):
@@ -432,7 +433,7 @@ def _nearest(place: Path, arguments: Sequence[str]) -> str:
         names = [item.name for item in folder.iterdir() if item.name != place.name and item.absolute() not in words]
     except OSError:
         names = []
-    # suggest close matches only: a loose match could be another flight's file
+    # suggest only a very similar name, because a less similar name could be another flight's file
     near = get_close_matches(place.name, names, n=1, cutoff=0.8) if folder == place.parent else []
     settings = [path.name for path, word in words.items() if word.endswith(_SETTINGS) and _exists(path)]
     if near and settings and place.absolute() not in words:

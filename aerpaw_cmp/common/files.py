@@ -21,15 +21,15 @@ LARGEST_TABLE = 64 << 20
 def inside(
     folder: Path, name: str, source: Path, *, plain: bool = False, error: type[AerpawCmpError] = InputError
 ) -> Path:
-    """Return the path, below a folder, of a file that another file names. Use this function for all such names.
+    """Return the path, below a folder, of a file that another file names. Use it for every name from a file.
 
     Parameters
     ----------
     folder : Path
     name : str
-        Name in the other file, which may come from a third party.
+        Name of the file as written in ``source``, which may come from a third party.
     source : Path
-        The other file, for the message.
+        The file that contains the name, for the message.
     plain : bool
         Also refuse names of files in subfolders.
     error : type
@@ -44,7 +44,7 @@ def inside(
     AerpawCmpError
         If the name is absolute, contains ``..`` or NUL, or a link on its path leaves the folder.
     """
-    parts = PureWindowsPath(name)  # refuse both separators, drives, and absolute POSIX paths
+    parts = PureWindowsPath(name)  # Windows rules recognise both separators, drives and absolute POSIX paths
     depth, place = len(parts.parts), folder.joinpath(*parts.parts)
     wrong = not depth or parts.anchor or ".." in parts.parts or "\0" in name or (plain and depth > 1)
     if wrong or not Path(os.path.realpath(place)).is_relative_to(os.path.realpath(folder)):
@@ -117,7 +117,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
 
 def _clear_old_parts(folder: Path, prefix: str) -> None:
-    """Remove temporary files of the same target that a killed run left more than an hour ago."""
+    """Remove temporary files of the same target that are more than an hour old: killed runs left them."""
     for part in folder.glob(f"{glob.escape(prefix)}*.part"):
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > 3600:
@@ -130,9 +130,9 @@ def opened(path: Path, expected: str = "a file") -> BinaryIO:
     Raises
     ------
     InputError
-        If it is a pipe, a device or a socket. Opening or reading one may wait forever.
+        If the path is a pipe, a device or a socket, because opening or reading it may wait forever.
     OSError
-        If it cannot be opened.
+        If the file cannot be opened.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise InputError("not a regular file", expected=expected, cause="a pipe, a device or a socket", path=path)
@@ -158,7 +158,7 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
     InputError
         If the file has more bytes, or is a pipe, a device or a socket.
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     """
     with opened(path, expected) as file:
         size = os.fstat(file.fileno()).st_size
@@ -242,7 +242,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 def plain_mode() -> int:
     """Return the permissions of an ordinary new file."""
-    # the only way to read the mask is to set it
+    # set the mask and restore it, because the mask cannot be read otherwise
     mask = os.umask(0)
     os.umask(mask)
     return 0o666 & ~mask

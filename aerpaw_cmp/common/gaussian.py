@@ -1,8 +1,8 @@
 """Gaussian processes: a kernel, the points that determine a process, and predictions from known values.
 
-A process is given by covariances alone. ``C`` is the covariance of the known values (including their noise), ``K`` is
-the covariance of the targets with the known values, and ``L L' = C``. Every prediction is a product with the white
-values ``L^-1 y`` of known ``y`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1).
+A process is described only by its covariances. ``C`` is the covariance of the known values (including their noise),
+``K`` is the covariance of the targets with the known values, and ``L L' = C``. Every prediction is a product with the
+white values ``L^-1 y`` of known ``y`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def gaussian_kernel(first: FloatArray, second: FloatArray, length: float) -> Flo
     from scipy.spatial.distance import cdist
 
     kernel = np.asarray(cdist(first, second, "sqeuclidean"))
-    # compute in place: two more matrices of this size would take as long as the exponentials
+    # compute in place, because allocating two more matrices of this size would take as long as the exponentials
     kernel /= -2.0 * length**2
     np.exp(kernel, out=kernel)
     return kernel
@@ -99,7 +99,7 @@ class Factor:
         mean : (m,) or (m, k)
             ``K C^-1 y``.
         explained : (m,)
-            ``diag(K C^-1 K')``: the reduction of each target's variance by the known values.
+            ``diag(K C^-1 K')``: the amount by which the known values reduce the variance of each target.
         """
         half = self.whiten(across.T)
         return half.T @ white, np.einsum("nm,nm->m", half, half)
@@ -131,7 +131,8 @@ def determining(
     share : float
         Largest share of the variance that remains at any point.
     most : int
-        Largest number of points. If it is reached first, more than ``share`` of the variance remains.
+        Largest number of points. If this number is reached first, more than ``share`` of the variance remains at some
+        points.
 
     Returns
     -------
@@ -148,7 +149,8 @@ def determining(
         at, known = int(remaining.argmax()), rows[: len(chosen)]
         rows[len(chosen)] = (kernel(points[at : at + 1], points)[0] - known[:, at] @ known) / math.sqrt(remaining[at])
         remaining = np.maximum(remaining - rows[len(chosen)] ** 2, 0.0)
-        # exactly 0: after rounding errors, the same point could be selected again
+        # set the remaining variance of this point to exactly 0: with a rounding error, the point could be selected
+        # again
         remaining[at] = 0.0
         chosen.append(at)
     return np.array(chosen, dtype=np.int64)

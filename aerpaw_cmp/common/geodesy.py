@@ -44,7 +44,7 @@ class SiteFrame:
         from pyproj import Proj
 
         projection = Proj(proj="aeqd", lat_0=self.latitude_deg, lon_0=self.longitude_deg, ellps="WGS84")
-        # created once: building it takes a hundred times as long as converting a position
+        # create the projection once, because creating it takes a hundred times as long as converting a position
         object.__setattr__(self, "_projection", projection)
 
     def to_local(self, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -63,7 +63,7 @@ class SiteFrame:
 
 
 def bearing_deg(vectors: FloatArray) -> FloatArray:
-    """Return compass bearings (...) of vectors (..., 2 or more) east, north: clockwise from north, (-180, 180] deg.
+    """Return compass bearings (...) of vectors (..., 2 or more: east, north), clockwise from north, in (-180, 180] deg.
 
     Examples
     --------
@@ -91,11 +91,11 @@ def elevation_rad(vectors: FloatArray) -> FloatArray:
 
 def unit_vectors(vectors: FloatArray) -> FloatArray:
     """Return vectors (n, 3) scaled to length one. Zero vectors stay zero."""
-    # 0 / 1e-300 is 0 and does not change any real length; 0 / 0 would be NaN with a warning
+    # the limit does not change any real length; without it, 0 / 0 would be NaN with a warning
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300))
 
 
-# Length of one degree of a meridian, to 0.5 %, for distances that are compared with a limit.
+# Length of one degree of a meridian [m], accurate to 0.5 %, for distances that are only compared with a limit.
 _DEGREE_M = 111_200.0
 
 
@@ -114,7 +114,7 @@ def rough_m(latitude_deg: FloatArray, longitude_deg: FloatArray, about: Sequence
 def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return coordinates transformed by pyproj, in their common shape.
 
-    pyproj up to 3.7.1 treats an array of one element as a number.
+    Arrays of one element are handled separately, because pyproj up to 3.7.1 treats such an array as a number.
 
     Parameters
     ----------

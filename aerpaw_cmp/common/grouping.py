@@ -1,4 +1,4 @@
-"""Values grouped by key."""
+"""Grouping of values by key."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _Value = TypeVar("_Value")
 
 
 def lists_by_key(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
-    """Return the values of pairs of key and value in one list per key, keys and values in order of appearance.
+    """Return the values of (key, value) pairs in one list per key. Keys and values are in order of appearance.
 
     Examples
     --------

@@ -1,19 +1,20 @@
-"""Ctrl-C, SIGTERM and SIGHUP are never lost: an interrupt that Python swallows is raised later, at a safe point.
+"""Handling of Ctrl-C, SIGTERM and SIGHUP: an interrupt that Python swallows is raised later, at a safe point.
 
-An interrupt is an exception that may occur anywhere, even where Python cannot raise it: in code around a fork, in a
-finaliser, in the callback of a weak reference ("Exception ignored in ..."). Before Python 3.12 an interrupt inside a
-class body becomes a RuntimeError. A command records each interrupt, checks for it before each stage and before an
-output is renamed, and delays it during steps that must not be split.
+An interrupt is an exception that may occur anywhere, even where Python cannot pass it on: in code around a fork, in a
+finaliser, in the callback of a weak reference. Python then only prints "Exception ignored in ...". Before Python 3.12
+an interrupt inside a class body becomes a RuntimeError. A command records each interrupt, checks for it before each
+stage and before an output is renamed, and delays it during steps that must not be interrupted.
 
-A call of compiled code (LLVM, linear algebra, Sionna) may last for minutes, during which Python handles no signals. A
-second thread then ends the process.
+A call of compiled code (LLVM, linear algebra, Sionna) may last for minutes, during which Python handles no signals. If
+a signal arrives during such a call, a second thread ends the process.
 
 scancel, systemd and docker send SIGTERM, and a closed terminal sends SIGHUP. Both signals end a command as Ctrl-C does.
 
-A standard stream that is closed, full or gone is not treated as a bug of the program.
+Errors of a standard stream that is closed, or whose disk or reader is full or gone, are not reported as bugs of the
+program.
 
-The streams of a command store the first error of their descriptor and then discard output; :func:`output_fault` returns
-it.
+The streams of a command store the first error of their descriptor and then discard output. :func:`output_fault` returns
+this error.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 # The exit code after a signal is this number plus the number of the signal.
 SIGNALLED = 128
 
-# Functions to call when :func:`noted` ends: they remove hidden files whose creation was interrupted.
+# Functions that :func:`noted` calls when it ends. They remove hidden files whose creation was interrupted.
 AT_END: list[Callable[[], None]] = []
 
 # Time that compiled code may continue after a signal: half of the second within which a command should end.
@@ -58,7 +59,7 @@ def last() -> signal.Signals:
 
 
 def raise_interrupt() -> None:
-    """Raise the interrupt that was swallowed.
+    """Raise the interrupt that Python swallowed, if there was one.
 
     Raises
     ------
@@ -71,7 +72,7 @@ def raise_interrupt() -> None:
 
 @contextmanager
 def noted() -> Iterator[None]:
-    """Record the interrupts of a command. A signal that the process ignores (nohup, background) stays ignored.
+    """Record interrupts while a command runs. A signal that the process ignores (nohup, background) stays ignored.
 
     Raises
     ------
@@ -85,7 +86,7 @@ def noted() -> Iterator[None]:
         return
     _last = signal.SIGINT
     previous = sys.unraisablehook
-    # do not let Python print that it ignored the interrupt: it is raised later
+    # do not let Python print that it ignored the interrupt, because the interrupt is raised later
     sys.unraisablehook = lambda what: None if what.exc_type is KeyboardInterrupt else previous(what)
     try:
         with _watched():
@@ -95,7 +96,7 @@ def noted() -> Iterator[None]:
             raise
         raise KeyboardInterrupt from error
     finally:
-        # a second signal would stop the clean-up
+        # ignore further signals, because they would stop the clean-up
         _set(SIGNALS, signal.SIG_IGN, _note)
         _clear()
         _signalled = False
@@ -105,7 +106,7 @@ def noted() -> Iterator[None]:
 
 
 def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> list[tuple[int, _Handler]]:
-    """Set a handler for signals whose handler is in ``untouched`` (default: Python's). Return the previous handlers."""
+    """Set a handler for signals whose handler is in ``untouched`` (default: Python's), and return the old handlers."""
     if threading.current_thread() is not threading.main_thread():
         return []
     # a program that embeds this one may handle its signals, so keep its handlers
@@ -129,7 +130,7 @@ def _clear() -> None:
 
 @contextmanager
 def _watched() -> Iterator[None]:
-    """Start a thread that handles signals while the main thread is in code that cannot."""
+    """Start a thread that handles signals while the main thread runs compiled code, which cannot handle them."""
     read, write = os.pipe()
     # set_wakeup_fd refuses a descriptor that could block the handler
     os.set_blocking(write, False)
@@ -194,15 +195,16 @@ class _Descriptor(io.FileIO):
                 return super().write(data)
             except OSError as error:
                 self.fault = error
-        # report all bytes as written: otherwise the caller would try again forever
+        # report all bytes as written, because the caller would otherwise try again forever
         return memoryview(data).nbytes
 
 
 def guard() -> None:
     """Replace the standard streams of this process by :class:`_Descriptor`, except streams of tests or other programs.
 
-    Closed descriptors are opened first: otherwise the next files would get their numbers and receive the printed
-    output. Writing to them fails as before.
+    Closed descriptors are opened first: otherwise the next files that are opened would get the numbers of these
+    descriptors and receive the printed output. Writing to the opened descriptors fails, as it did when they were
+    closed.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         closed = _is_closed(number)
@@ -226,7 +228,7 @@ def _is_closed(number: int) -> bool:
 
 def _stream(number: int, encoding: str, *, buffered: bool) -> io.TextIOWrapper:
     raw = _Descriptor(number, "w", closefd=False)
-    # do not fail because the terminal cannot show a character
+    # escape a character that the terminal cannot show, instead of failing
     return io.TextIOWrapper(
         io.BufferedWriter(raw) if buffered else raw,  # type: ignore[arg-type]
         encoding=encoding,
@@ -237,7 +239,7 @@ def _stream(number: int, encoding: str, *, buffered: bool) -> io.TextIOWrapper:
 
 
 def output_fault() -> OSError | None:
-    """Flush standard output. Return the error if that failed, else None."""
+    """Flush standard output. Return the error if the flush or an earlier write failed, else None."""
     try:
         sys.stdout.flush()
     except OSError as error:

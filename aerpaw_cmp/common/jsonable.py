@@ -26,15 +26,15 @@ def number_key(number: float) -> str:
 def json_safe(value: Any) -> Any:
     """Return a copy for JSON. NaN and infinity become None, arrays become lists, and records become mappings.
 
-    A field of a record (dataclass) whose default is None is omitted if it is None, because the record does not have
-    this value.
+    A field of a record (dataclass) is omitted if its value and its default are both None, because the field does not
+    apply to the record.
 
     Examples
     --------
     >>> json_safe({"rmse_db": float("nan"), 10: np.array([1, 2])})
     {'rmse_db': None, '10': [1, 2]}
     """
-    # is_dataclass is also true for the class, which has no values
+    # is_dataclass is also true for a class, which has no field values
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return json_safe(fields_of(value))
     if isinstance(value, Mapping):
@@ -42,7 +42,7 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _listed(value)
     if isinstance(value, (list, tuple, set, frozenset)):
-        # the order of a set of strings differs between processes
+        # sort sets, because the order of a set of strings differs between processes
         return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
     # test this before integers, because bool is a subclass of int
     if isinstance(value, (bool, np.bool_)):
@@ -64,7 +64,7 @@ def json_object(**entries: Any) -> dict[str, Any]:
 
 def _listed(array: AnyArray) -> Any:
     if array.dtype.kind == "f":  # convert large maps in one pass
-        # Python's floats: JSON writes them with the fewest digits that restore the same value
+        # use Python's floats, because JSON writes them with the fewest digits that restore the same value
         boxed = array.astype(object)
         boxed[~np.isfinite(array)] = None
         return boxed.tolist()

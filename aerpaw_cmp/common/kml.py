@@ -1,9 +1,9 @@
 """Reading of third-party KML and writing of KMZ: coordinates, placemarks, lines, legends and the archive.
 
-Logs in KML are read by pattern, line by line (:data:`DATA`, :data:`POINT`): each line has to be counted, even in a
-truncated file. Maps and routes are read as XML.
+Logs in KML are read line by line with regular expressions (:data:`DATA`, :data:`POINT`), because each line has to be
+counted, even in a truncated file. Maps and routes are read as XML.
 
-Third-party XML files are refused if they could expand without limit or read other files.
+Third-party XML files are refused if parsing them could use unlimited memory or read other files.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from .units import FloatArray
 
 
 def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Element:
-    """Return the root element of an XML text. Tags keep their prefix, declared or not (:func:`plain` cuts it).
+    """Return the root element of an XML text. Tags keep their prefix, which :func:`plain_tag` removes.
 
     Raises
     ------
     InputError
-        If the text is not XML (with the line), contains entities, or is not UTF-8.
+        If the text is not XML (the message contains the line), contains entities, or is not UTF-8.
     """
     # UTF-16 would hide entities from this check
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
         raise InputError("the XML declares entities, or is not UTF-8", expected=expected, path=path)
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # accepts the common gx:Track without xmlns:gx
-    # request the text of an element in one piece: otherwise expat returns it line by line
+    # request the text of an element in one piece, because expat otherwise returns it line by line
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
@@ -63,7 +63,8 @@ def named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]
 def outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTree.Element]:
     """Yield elements below a root with one of the names, in order. Do not search inside these elements.
 
-    Map formats do not nest these elements. A file that does would be searched once per level.
+    Map formats do not nest these elements. If a file nested them, the inner elements would otherwise be searched again
+    at each level.
     """
     walk = list(reversed(root))
     while walk:
@@ -79,8 +80,9 @@ _DPI = 110
 
 # --- reading -------------------------------------------------------------------------------------------------------
 
-# A named value and the first position of a shape, on a line of a log. Repeats are bounded: a third-party line may be
-# megabytes long, and unbounded repeats would search all of it from each start.
+# A named value and the first position of a shape, on a line of a log. The numbers of repetitions are bounded: a
+# third-party line may be megabytes long, and unbounded repetitions would search the complete line from each possible
+# start.
 DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
 _DECIMAL = rb"([-+]?[\d.]{1,20})"
 POINT = re.compile(rb"<coordinates>\s{0,40}%b,\s?%b(?:,\s?%b)?" % (_DECIMAL, _DECIMAL, _DECIMAL))
@@ -88,7 +90,7 @@ POINT = re.compile(rb"<coordinates>\s{0,40}%b,\s?%b(?:,\s?%b)?" % (_DECIMAL, _DE
 
 def is_kml(head: bytes) -> bool:
     """Check whether a file begins with KML."""
-    # a declaration, comments and a licence may come first
+    # search the beginning, because an XML declaration, comments and a licence may come before the tag
     return b"<kml" in head[:2048]
 
 
@@ -122,7 +124,7 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
         cells = [str(place.text or "").split() for place in named(shape, "coord")]
     else:
         texts = " ".join(str(places.text or "") for places in named(shape, "coordinates"))
-        # accept 'longitude, latitude' with a space, which is common and not ambiguous
+        # accept a space after the comma in 'longitude, latitude', which is common and not ambiguous
         cells = [place.split(",") for place in re.sub(r"\s*,\s*", ",", texts).split()]
     try:
         places = [tuple(float(cell) for cell in place) for place in cells]
@@ -135,8 +137,8 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
     return [part for place in places for part in ([place] if len(place) <= 3 else _triples(place))]
 
 
-# Within an area, longitudes differ by less than this [deg], and so do latitudes. The difference between a longitude and
-# a latitude is larger.
+# Largest difference of longitudes, and of latitudes, within one area [deg]. A longitude and a latitude usually differ
+# by more, which shows that numbers are grouped wrongly.
 _AREA_DEG = 5.0
 
 
@@ -167,12 +169,12 @@ def xml_text(text: str) -> str:
 def coordinates(longitude: FloatArray, latitude: FloatArray, up_m: FloatArray | float = 0.0) -> list[str]:
     """Return positions (n,) in KML format. Negative or unknown heights become 0."""
     up = np.broadcast_to(np.maximum(np.nan_to_num(up_m), 0.0), np.shape(longitude))
-    # 1e-7 degree is a centimetre
+    # seven decimals, because 1e-7 degree is a centimetre
     return [f"{a:.7f},{b:.7f},{h:.1f}" for a, b, h in zip(longitude, latitude, up, strict=True)]
 
 
 def mark(name: str, at: str, *, in_the_air: bool = False) -> str:
-    """Return a named point. A point in the air is drawn at its height, with a line down to the ground."""
+    """Return a placemark with a name. A point in the air is drawn at its height, with a line down to the ground."""
     height = "<extrude>1</extrude><altitudeMode>relativeToGround</altitudeMode>" if in_the_air else ""
     point = f"<Point>{height}<coordinates>{at}</coordinates></Point>"
     return f"<Placemark><name>{xml_text(name)}</name>{point}</Placemark>"
@@ -218,7 +220,7 @@ def folder(name: str, legend: str, content: str, *, visible: bool) -> str:
     content : str
         KML elements.
     visible : bool
-        Switched on when the file is opened.
+        True if the folder is switched on when the file is opened.
 
     Returns
     -------
@@ -272,7 +274,8 @@ def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> b
     import matplotlib
     from PIL import Image, ImageDraw, ImageFont
 
-    # a matplotlib figure would take 0.1 s; the background is partly transparent, so that the map stays visible
+    # draw with PIL, because a matplotlib figure would take 0.1 s; the background is partly transparent, so that the map
+    # stays visible
     size = round(width * _DPI), round((0.38 + 0.155 * len(colours)) * _DPI)
     picture = Image.new("RGBA", size, (255, 255, 255, 230))
     pen = ImageDraw.Draw(picture)

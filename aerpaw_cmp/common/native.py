@@ -26,8 +26,8 @@ from .units import AnyArray
 # Limit for all arrays of a file together [bytes].
 MOST_BYTES = 1 << 30
 MOST_RATIO = 200
-# Any file may declare this many bytes. A file may also declare up to ``MOST_RATIO`` times its own size, because text
-# compresses to a hundredth.
+# A file may declare this many bytes of data, plus ``MOST_RATIO`` times its own size, because text compresses to a
+# hundredth.
 FREE_BYTES = 1 << 26
 _MOST_ITEMS = 100_000
 _MOST_MEMORY = 4 << 30
@@ -71,10 +71,11 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
 
 def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
     """Return exit code, standard output and standard error of the child."""
-    # use isolated mode with the paths of this process: an untrusted working folder may contain a numpy.py
+    # use Python's isolated mode with the paths of this process, because an untrusted working folder may contain a
+    # numpy.py
     command = [sys.executable, "-I", "-c", _CHILD, kind, *(path for path in sys.path if path)]
     try:
-        # limits of processor time do not end a child that only waits
+        # set a timeout, because the limit of processor time does not end a child that only waits
         child = subprocess.run(command, input=data, capture_output=True, timeout=2 * SECONDS, check=False, env=_ENVIRON)
     except subprocess.TimeoutExpired:
         raise InputError(f"the file cannot be read within {2 * SECONDS} s", cause="a damaged file") from None
@@ -82,7 +83,7 @@ def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
 
 
 # The environment variables of the child process: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH, and one thread, because each
-# needs memory.
+# thread needs memory.
 _ENVIRON = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
 
 
@@ -97,7 +98,7 @@ def _unpacked(content: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
 
 def main(kind: str) -> None:
     """Read a file from standard input and write its arrays to standard output."""
-    # load libraries first: after the privileges are dropped, they could not be loaded
+    # load the libraries first, because they cannot be loaded after the privileges are dropped
     reader = READERS[kind]()
     data = sys.stdin.buffer.read()
     give_up_rights()
@@ -114,7 +115,7 @@ def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
     except InputError as error:
         refusal = {"found": error.found, "expected": error.expected, "cause": error.cause}
         return _REFUSED, b"", json.dumps(refusal).encode()
-    except Exception as error:  # libraries raise OSError, KeyError, RuntimeError, ... on damage, all meaning the same
+    except Exception as error:  # libraries raise OSError, KeyError, RuntimeError, ... for a damaged file
         return 1, b"", f"{type(error).__name__}: {one_line(str(error))}".encode()
     head = json.dumps({"names": list(arrays), "notes": notes}).encode()
     out = io.BytesIO()
@@ -124,7 +125,7 @@ def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
 
 
 def give_up_rights() -> None:
-    """Drop this process's privileges to open files and to use much memory and time."""
+    """Limit the memory and processor time of this process, and forbid it to open files."""
     try:
         import resource
     except ImportError:
@@ -179,7 +180,7 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
         for name, value in (("version", 1), ("text", "a"), ("MATLAB_class", np.bytes_(b"double"))):
             book["x"].attrs[name] = book.attrs[name] = value
         book.flush()
-        read(book.id.get_file_image())  # import what h5py and NumPy import late, because files cannot be opened later
+        read(book.id.get_file_image())  # let h5py and NumPy import everything, because files cannot be opened later
     # load zipfile, because answer() needs it when files cannot be opened
     np.savez(io.BytesIO(), np.zeros(1))
     return read
@@ -208,7 +209,7 @@ def _text(value: Any) -> str | int:
 
 
 def _data_sets(group: Any, depth: int, kinds: str, path: str = "", seen: set[Any] | None = None) -> dict[str, Any]:
-    """Return data sets of some kinds of numbers below a group, by path. Data sets outside the file are refused."""
+    """Return data sets below a group with types in ``kinds``, by path. Data sets outside the file are refused."""
     import h5py
 
     seen, found = set() if seen is None else seen, dict[str, Any]()
@@ -232,7 +233,8 @@ def _data_sets(group: Any, depth: int, kinds: str, path: str = "", seen: set[Any
 
 
 def _refuse_elsewhere(place: str, item: Any) -> None:
-    # a function, so that a test can switch it off and show that the kernel refuses as well
+    # a separate function, so that a test can switch it off and show that the limits of the child refuse the file as
+    # well
     if item.is_virtual or item.external:
         raise _lies_elsewhere(f"the data of {place!r} are in other files")
 
@@ -255,7 +257,7 @@ def _geotiff() -> Read:
     warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # the caller reports the cause
 
     def read(data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
-        # name the driver: GDAL treats a text that begins with <VRTDataset> as a list of other files
+        # specify the driver, because GDAL would treat a text that begins with <VRTDataset> as a list of other files
         with MemoryFile(data) as file, file.open(driver="GTiff") as image:
             if image.count != 1:
                 raise InputError(f"{image.count} bands", expected="one band of heights", cause="a picture, not heights")

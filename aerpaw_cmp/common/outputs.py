@@ -1,6 +1,6 @@
-"""Output files and folders: they overwrite only outputs of this tool, and are written atomically.
+"""Output files and folders. They replace only outputs of this tool, and are written atomically.
 
-The two kinds of result follow the same rule:
+Files and folders follow the same rules:
 
 =====================  =======================================================  ==================================
 kind                   proof that this tool wrote it                            how the new output gets the name
@@ -13,9 +13,9 @@ An input is never replaced, with or without ``--force``. Inputs are compared by 
 recognised. Files that this tool did not write, or that were changed afterwards, are replaced only with ``--force``.
 
 The hidden path next to the target (``.NAME.aerpaw-part``) is created before any computation, so that a bad ``-o`` is
-reported first. The hidden output is locked (flock) until the run ends: a second run into the same target is refused. A
-killed run leaves at most that hidden path, and the next run into the target removes it. See docs/security.md for the
-exact guarantees.
+reported first. This hidden output is locked (flock) until the run ends, so that a second run into the same target is
+refused. A killed run leaves at most that hidden path, and the next run into the target removes it. See docs/security.md
+for the exact guarantees.
 
 The module also contains a stream that HDF5 can write to.
 """
@@ -38,7 +38,7 @@ from .errors import InputError, OutputError, UsageError, add_note, one_line
 from .files import inside, plain_mode, sync
 from .interrupts import AT_END, held, interrupted, raise_interrupt
 
-# The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it.
+# File in a result folder that lists its files; ``sha256sum -c SHA256SUMS`` checks them.
 SUMS = "SHA256SUMS"
 _SUMS_HEAD = "# aerpaw-cmp:"
 _SEAL = "# aerpaw-cmp wrote this file; SHA-256 of the lines below: "
@@ -49,7 +49,7 @@ _UNFINISHED = ".unfinished"
 
 
 def sealed(text: str) -> bytes:
-    r"""Return a text after a comment line that contains the SHA-256 of the text.
+    r"""Return a text in UTF-8, preceded by a comment line that contains the SHA-256 of the text.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def is_sealed(path: Path) -> bool:
 
 
 def check_seal(path: Path) -> None:
-    """Refuse a file with a seal of :func:`sealed` whose other lines were changed. Accept a file without a seal.
+    """Refuse a file whose lines were changed after :func:`sealed` created it. Accept a file without a seal.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def check_seal(path: Path) -> None:
 def read_sums(folder: Path) -> dict[str, str] | None:
     """Return the SHA-256 of each file of a result folder by relative name. None if there is no valid list.
 
-    A list that names a file outside the folder is not valid, because the listed files may be removed.
+    A list that names a file outside the folder is not valid, because this tool may remove the listed files.
     """
     try:
         text = (folder / SUMS).read_text(encoding="utf-8")
@@ -148,7 +148,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def _real(path: Path) -> Path:
-    """Return the path with links resolved. UsageError for an impossible name."""
+    """Return a path with links resolved. Raise UsageError if the name is not possible."""
     try:
         return Path(os.path.realpath(path))
     except (OSError, ValueError) as error:
@@ -159,7 +159,7 @@ def _real(path: Path) -> Path:
 
 
 class OutputFile:
-    """A file that a command writes, as a context around the whole command.
+    """A context around a complete command that writes one file.
 
     Parameters
     ----------
@@ -224,14 +224,14 @@ class OutputFile:
             )
 
     def write(self, content: bytes | Callable[[BinaryIO], None]) -> None:
-        """Write and sync the file, then rename it: even after a power cut, the target is the old or the new file.
+        """Write and sync the file, then rename it, so that after a power cut the target is the old or the new file.
 
-        ``content`` may be a function that writes to a stream. The stream can also be read.
+        ``content`` may be a function that writes to a stream. The function can also read from the stream.
         """
         place = self._place
         assert place is not None, "used as a context"
         with explained_os_errors(self.named):
-            # use a copy, because closing the stream would release the lock
+            # use a copy of the descriptor, because closing the descriptor itself would release the lock
             with os.fdopen(os.dup(place.descriptor), "r+b") as stream:
                 if callable(content):
                     content(stream)
@@ -245,7 +245,7 @@ class OutputFile:
             raise_interrupt()
             with held():
                 place.part.rename(self.target)
-                place.leave()  # HDF5 does not open a locked file
+                place.leave()  # unlock, because HDF5 does not open a locked file
                 self._place = None
                 _sync_folder(self.target.parent)
 
@@ -276,7 +276,7 @@ def _replaces_input(named: Path, path: Path) -> UsageError:
 
 
 class OutputFolder:
-    """A context around the whole command for a folder of results, which is replaced as a whole.
+    """A context around a complete command that writes a folder of results. The folder is replaced completely.
 
     Parameters
     ----------
@@ -311,7 +311,7 @@ class OutputFolder:
         self.named, self.target = Path(target), _real(Path(target))
         self._job, self._inputs, self._force = job, tuple(inputs), force
         self._place: _Place | None = None
-        self._made: list[Path] = []  # parent folders created for this run are removed if the run fails
+        self._made: list[Path] = []  # parent folders that this run created; they are removed if it fails
         self._written = False
 
     def __enter__(self) -> OutputFolder:
@@ -327,7 +327,7 @@ class OutputFolder:
                 self._refuse_content()
                 (self._place.part / _UNFINISHED).touch()
             except BaseException:
-                # Python calls this only if the block was entered
+                # Python calls __exit__ only if __enter__ succeeded
                 self.__exit__(None, None, None)
                 raise
         return self
@@ -337,7 +337,7 @@ class OutputFolder:
             if self._place is not None:
                 self._place.leave()
                 self._place = None
-            # deepest first: a parent is empty only then
+            # remove the deepest folder first, because its parent is empty only afterwards
             for place in reversed(self._made):
                 with contextlib.suppress(OSError):
                     place.rmdir()
@@ -369,7 +369,7 @@ class OutputFolder:
         """Raise UsageError if the folder contains files that this tool did not write or that were changed later."""
         if not self.target.is_dir():
             return
-        # its files could not be removed after the computation
+        # refuse a read-only folder now, because its files could not be replaced after the computation
         if not os.access(self.target, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self.target))
         own = read_sums(self.target)
@@ -422,7 +422,7 @@ class OutputFolder:
         replaced = self.target.is_dir()
         for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
             before = self.target / folder.relative_to(place.part)
-            if before.is_dir():  # keep the folder private if the user made it private
+            if before.is_dir():  # keep the permissions of the replaced folder, which may be private
                 folder.chmod(stat.S_IMODE(before.stat().st_mode))
         (place.part / _UNFINISHED).unlink(missing_ok=True)
         _sync_folder(place.part)
@@ -438,7 +438,7 @@ class OutputFolder:
 
 
 def foreign_entries(folder: Path, own: Iterable[str]) -> Iterator[str]:
-    """Yield entries of a folder that are not files of this tool: files, links, folders, other file systems.
+    """Yield the entries of a folder that this tool did not write: files, links, folders, other file systems.
 
     Parameters
     ----------
@@ -468,7 +468,7 @@ def _mounted_below(folder: Path) -> list[Path]:
         lines = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     except OSError:
         return []
-    # spaces and similar characters are octal numbers in this list
+    # this list contains spaces and similar characters as octal numbers
     points = (re.sub(r"\\(\d{3})", lambda code: chr(int(code[1], 8)), line.split(" ")[4]) for line in lines)
     return [Path(point) for point in points if folder in Path(point).parents]
 
@@ -485,7 +485,7 @@ def hidden_name(target: Path, suffix: str) -> Path:
 
 
 class _Place:
-    """The locked path ``.NAME.aerpaw-part``. Remains of a killed run are cleared."""
+    """The locked path ``.NAME.aerpaw-part``. Remains of a killed run at this path are removed."""
 
     def __init__(self, target: Path, named: Path, *, folder: bool) -> None:
         self.named = named
@@ -506,7 +506,7 @@ class _Place:
                 raise
 
     def _empty(self) -> None:
-        """Clear the remains of a killed run. Raise UsageError if it contains other files."""
+        """Remove the remains of a killed run. Raise UsageError if the path contains other files."""
         with contextlib.suppress(OSError):
             _clear(self.part, keep=True)
         if foreign := next(self.part.iterdir(), None):
@@ -524,8 +524,8 @@ class _Place:
                         self.part.mkdir()
                     descriptor = os.open(self.part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
                 else:
-                    # do not follow a link, which another user could have put into a shared folder; the file is private
-                    # until it is finished
+                    # do not follow a link, because another user could have put it into a shared folder. The file is
+                    # private until it is finished.
                     descriptor = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             except FileNotFoundError:
                 if not self.part.parent.is_dir():
@@ -550,7 +550,7 @@ class _Place:
         )
 
     def lock_too(self, folder: Path) -> None:
-        """Also lock a folder that will get this path."""
+        """Also lock a folder that will be moved to this path."""
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         self._further.append(descriptor)
         _lock(descriptor)
@@ -560,19 +560,19 @@ class _Place:
         return _identity(self.part) == (status.st_dev, status.st_ino)
 
     def refuse_gone(self) -> None:
-        """Raise an error if the place was removed or replaced."""
+        """Raise FileNotFoundError if the path was removed or replaced."""
         if not self._is_there(self.descriptor):
             raise FileNotFoundError(errno.ENOENT, "removed during the run", str(self.part))
 
     def leave(self) -> None:
-        """Remove the parts that did not take the target's name, and unlock."""
+        """Remove what is still at the hidden path, and unlock it."""
         if self._left:
             return
         self._left = True
         if self.leave in AT_END:
             AT_END.remove(self.leave)
         descriptors = (self.descriptor, *self._further)
-        # clear it only if it is ours: otherwise it belongs to another run or does not exist
+        # remove the path only if it is one of the locked files: otherwise it belongs to another run or does not exist
         if any(self._is_there(descriptor) for descriptor in descriptors):
             with contextlib.suppress(OSError):
                 _clear(self.part) if self.part.is_dir() else self.part.unlink()
@@ -594,24 +594,24 @@ def _lock(descriptor: int) -> bool:
     except ImportError:
         return True
     except OSError as error:
-        # every other failure means a disk without locks, which is not a reason to refuse
+        # all other errors mean that the disk has no locks, which is not a reason to refuse
         return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
     return True
 
 
 def _clear(part: Path, *, keep: bool = False) -> None:
-    """Empty a temporary folder and, unless ``keep``, remove it. OSError if it contains files that are not this tool's.
+    """Empty a temporary folder and, unless ``keep``, remove it. OSError if foreign files remain.
 
     A folder with ``.unfinished`` was being filled, so this tool wrote all its files. Otherwise it contains the replaced
     results, and this tool wrote only the listed files. Both markers are removed last, so that a killed run can be
     continued.
     """
-    # os.walk enters mounts, and unlink would empty the mounted disk
+    # refuse mounts, because os.walk enters them and unlink would delete the files of the mounted disk
     if _mounted_below(part):
         raise OSError(errno.EXDEV, "a file system is mounted there", str(part))
-    # the rights of replaced results may not allow removing their files
+    # add permissions, because the permissions of replaced results may not allow removing their files
     for folder in (part, *(Path(parent, name) for parent, names, _ in os.walk(part) for name in names)):
-        # only the owner can change the rights, but a group may be able to write
+        # change permissions only if necessary: only the owner may change them, but a group may be able to write
         if not folder.is_symlink() and not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             folder.chmod(stat.S_IMODE(folder.stat().st_mode) | stat.S_IRWXU)
     signs = [part / _UNFINISHED, part / SUMS]
@@ -644,7 +644,7 @@ def _exchange(part: Path, target: Path) -> None:
 
 
 def _restore(target: Path) -> None:
-    """Undo the first step of a swap that was killed between its steps: the old set gets its name back."""
+    """Undo the first step of a swap that was killed between its steps: the old folder gets its name again."""
     old = hidden_name(target, "old")
     if not old.is_dir() or not _is_own(old.lstat()):
         return
@@ -675,7 +675,7 @@ def _names_swapped(first: Path, second: Path) -> bool:
 
 
 def _sync_tree(folder: Path) -> None:
-    # deepest first: sync the content of a folder before the folder
+    # go through the deepest folders first, so that the content of a folder is synced before the folder
     for parent, _, names in os.walk(folder, topdown=False):
         for name in names:
             if not Path(parent, name).is_symlink():
@@ -684,7 +684,7 @@ def _sync_tree(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync the names in a folder to the disk. Not every system can sync folders."""
+    """Sync the names in a folder to the disk. Ignore the error of a system that cannot sync folders."""
     try:
         sync(folder)
     except OSError as error:
@@ -706,7 +706,7 @@ _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, e
 
 
 def _taken(path: Path) -> bool:
-    """Check whether the name is in use. Raise OSError for an impossible name, which ``lexists`` treats as free."""
+    """Check whether a name is in use. Raise OSError for an impossible name, which ``lexists`` would treat as unused."""
     try:
         path.lstat()
     except FileNotFoundError:
@@ -732,7 +732,7 @@ def explained_os_errors(path: str | Path) -> Iterator[None]:
 class Sink:
     """A stream that never raises inside HDF5, because HDF5 ends the process if the disk is full.
 
-    The first exception or interrupt is stored for :meth:`raise_spared`. Later writes are ignored.
+    The first exception or interrupt is stored, and :meth:`raise_spared` raises it. Later writes are ignored.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -748,7 +748,7 @@ class Sink:
         if self._failure is None:
             try:
                 return action(*given)
-            # also catch interrupts: they could stop HDF5 in the middle of a write
+            # also catch interrupts, because they could stop HDF5 in the middle of a write
             except BaseException as failure:
                 self._failure = failure
         return instead

@@ -26,7 +26,7 @@ class Progress(Protocol):
 
 
 _LOGGER = logging.getLogger("aerpaw_cmp")
-# a library does not print its log by default: add a handler to this logger or call basicConfig
+# do not print the log by default, because this package is also a library. Users add a handler or call basicConfig.
 _LOGGER.addHandler(logging.NullHandler())
 
 
@@ -39,7 +39,7 @@ def logged(text: str, fraction: float | None = None, /) -> None:
 
 
 def duration(seconds: float) -> str:
-    """Return seconds in a unit that is read at a glance.
+    """Return a duration as text in seconds, minutes or hours.
 
     Examples
     --------
@@ -53,7 +53,7 @@ def duration(seconds: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PlannedStage:
-    """A planned stage. ``work`` is its input, ``seconds`` its measured or estimated time, None if unknown."""
+    """A planned stage. ``work`` is its input, ``seconds`` its measured or estimated time [s], None if unknown."""
 
     name: str
     work: str
@@ -70,7 +70,7 @@ class Plan:
     inputs : tuple of Path
         Files that would be read.
     output : Path
-        The path that would be written. The check has confirmed that it can be written.
+        The path that would be written. The dry run has confirmed that it can be written.
     stages : tuple of PlannedStage
     """
 
@@ -90,7 +90,7 @@ class Plan:
 
 
 class NotRun(Exception):  # noqa: N818  # not an error: a dry run ends with it
-    """The exception at the point where a dry run would begin to compute. ``plan`` contains what a run would do."""
+    """The exception that ends a dry run where the computation would begin. ``plan`` contains what a run would do."""
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(f"{plan.job} was not run")
@@ -124,7 +124,7 @@ class Stages:
     plan: Plan | None = None
 
     def checked(self, rest: Callable[[], Iterable[PlannedStage]]) -> None:
-        """End a dry run with :class:`NotRun`. A job calls this before it computes the remaining stages ``rest``."""
+        """End a dry run with :class:`NotRun`. A job calls this before it computes the remaining stages, ``rest``."""
         if self.plan is not None:
             done = (PlannedStage(name, "done", seconds) for name, seconds in self.seconds.items())
             raise NotRun(replace(self.plan, stages=(*done, *rest())))
@@ -140,7 +140,7 @@ class Stages:
         try:
             yield
         finally:
-            # store it even after a failure or an interrupt, because the page reports the time spent
+            # store the time even after a failure or an interrupt, because the page reports the time spent
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
             give_memory_back()
 
@@ -162,8 +162,8 @@ def peak_mib() -> float:
 def give_memory_back() -> None:
     """Return freed pages to the system, if the C library can (glibc: ``malloc_trim``).
 
-    A stage frees most of its memory in small pieces between blocks that are still in use. After a flight of ten hours a
-    quarter of a GiB of such free pieces would remain from stage to stage.
+    A stage frees most of its memory in small pieces between blocks that are still in use. After a stage that processes
+    a flight of ten hours, a quarter of a GiB of such free pieces would remain allocated.
     """
     trim = getattr(_library(), "malloc_trim", None)
     if trim is not None:
@@ -174,5 +174,5 @@ def give_memory_back() -> None:
 def _library() -> ctypes.CDLL | None:
     try:
         return ctypes.CDLL(None)
-    except (OSError, TypeError):  # this system does not provide the symbols of the running program
+    except (OSError, TypeError):  # this system cannot look up symbols of the running program
         return None

@@ -1,11 +1,11 @@
 """Short texts: the commands and their help, counts with nouns, cells of CSV files, HTML tables.
 
-The commands and their one-line help are in this module, so that ``--help`` does not load anything else.
+The commands and their one-line help are in this module, so that ``--help`` does not load any other module.
 
-The module also writes counts with their nouns, and decodes lines of tables.
+The module also formats counts with their nouns, and decodes lines of tables.
 
-Text cells of CSV files are guarded: names come from third-party logs, and a spreadsheet runs cells that begin with = +
-- or @.
+Text cells of CSV files are guarded, because names come from third-party logs, and a spreadsheet evaluates cells that
+begin with = + - or @ as formulas.
 
 Records are shown in notebooks as a small HTML table.
 """
@@ -51,15 +51,15 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     >>> counted(1, "row is", "rows are"), counted(2, "row is", "rows are")
     ('1 row is', '2 rows are')
     """
-    # a narrow no-break space, because a comma is the decimal sign of many readers
+    # use a narrow no-break space, because many readers would read a comma as the decimal sign
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
-# Start of a cell, which may also follow a semicolon. An apostrophe of the log is guarded, too, because unguarded()
-# would otherwise remove it
+# Start of a cell that has to be guarded. A cell may also begin after a semicolon. An apostrophe from the log is
+# guarded, too, because unguarded() would otherwise remove it.
 _BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
 _GUARDED = re.compile(r"(^|;)'")
-# In a comment a cell also begins after a separator. Numbers are not guarded, because comments may contain tables of
+# In a comment, a cell begins after a separator. Numbers are not guarded, because comments may contain tables of
 # numbers.
 _IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
 
@@ -69,7 +69,7 @@ _NOT_LATIN = re.compile(rb"[\x80-\x9f]|[\xa0-\xff]{3}|[\xc2-\xdf][\xa0-\xbf]")
 
 
 def decoded(line: bytes) -> str:
-    r"""Return a line as text in UTF-8, or in Latin-1 as programs of Western Europe write it.
+    r"""Return a line decoded as UTF-8, or as Latin-1, which some programs in Western Europe write.
 
     Examples
     --------
@@ -83,14 +83,14 @@ def decoded(line: bytes) -> str:
 
 
 def guarded(table: Any) -> Any:
-    """Return a data frame without text that a spreadsheet would run as a formula. An apostrophe precedes such text.
+    """Return a data frame in which an apostrophe precedes each text that a spreadsheet would evaluate as a formula.
 
     Numbers stay numbers. :func:`unguarded` restores the texts.
     """
     guarded_columns = {}
     for name in table.columns:
         if table[name].dtype.kind == "O" or str(table[name].dtype).startswith("str"):
-            # check each distinct word once, because a million rows contain a few names
+            # check each distinct word once, because a million rows contain only a few different names
             words = [word for word in table[name].unique() if isinstance(word, str) and _BEGINNING.search(word)]
             if words:
                 texts = table[name].astype(object)
@@ -111,7 +111,7 @@ def guarded_text(word: str) -> str:
 
 
 def guarded_comment(line: str) -> str:
-    """Return a comment line of a table whose parts between separators are not formulas.
+    """Return a comment line of a table with an apostrophe before each part that a spreadsheet would evaluate.
 
     Examples
     --------

@@ -32,7 +32,8 @@ MINIMUM_HEIGHT_M = 0.5
 # International foot [m] (exact).
 FOOT_M = 0.3048
 
-# Range of carriers [Hz] that a setting accepts. A smaller number is in MHz or GHz; a larger one was converted twice.
+# Range of carriers [Hz] that a setting accepts. A smaller number is probably in MHz or GHz, and a larger number was
+# probably converted twice.
 LOWEST_CARRIER_HZ, HIGHEST_CARRIER_HZ = 1e6, 1e12
 
 # Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact).
@@ -58,8 +59,8 @@ class Printed(float):
 def unmasked(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:
     """Return an array of numbers with NaN instead of masked values, such as gaps of NetCDF and GeoTIFF.
 
-    Each function that receives arrays from callers calls it first: ``np.asarray`` would return the values under the
-    mask.
+    Each function that receives arrays from callers calls this function first, because ``np.asarray`` would return the
+    values under the mask.
 
     Examples
     --------
@@ -100,7 +101,7 @@ def power_from_db(level_db: ArrayLike) -> FloatArray:
 
 
 def db_from_amplitude(amplitude: ArrayLike) -> FloatArray:
-    """Return 20 log10 of a ratio of magnitudes (voltages, fields, singular values). Zero returns -inf silently.
+    """Return 20 log10 of a ratio of magnitudes (voltages, fields, singular values). For zero, return -inf.
 
     Examples
     --------
@@ -146,7 +147,7 @@ def spread_out(count: int, most: int) -> IntArray:
 
 
 def carrier_fault(carrier_hz: float) -> str:
-    """Return what is wrong with a carrier frequency. Empty if a radio can use it.
+    """Return a sentence about an implausible carrier frequency. Empty if the frequency is plausible.
 
     Examples
     --------

@@ -21,7 +21,7 @@ NOT_INSTALLED = "not installed"
 
 @cache
 def version(package: str) -> str:
-    """Return the version of an installed package, else "not installed". The metadata of each package is read once."""
+    """Return the version of an installed package, else "not installed". Cached, so that metadata are read only once."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -30,9 +30,10 @@ def version(package: str) -> str:
 
 @cache
 def commit() -> str:
-    """Return the commit of this tree, ``abc1234`` or ``abc1234.dirty``. "" for a release.
+    """Return the commit of the source tree, ``abc1234`` or ``abc1234.dirty``. Empty for a release.
 
-    A checkout queries Git. A wheel contains the commit of the tree from which it was built (``tools/commit_file.py``).
+    In a checkout, Git is queried. A wheel contains the commit of the tree from which it was built
+    (``tools/commit_file.py``).
     """
     package = Path(__file__).parents[1]
     written = package / COMMIT_FILE
@@ -41,7 +42,7 @@ def commit() -> str:
     if not (package.parent / ".git").exists():
         return ""
     release = f"v{__version__}"
-    # --long always adds the number of commits after the tag, so that the output has one form
+    # --long always adds the number of commits after the tag, so that the output always has the same form
     ask = ["git", "-C", str(package.parent), "describe", "--tags", "--always", "--long", "--abbrev=7"]
     try:
         # do not use a shell, because the path of a checkout may contain spaces and quotes
@@ -55,10 +56,11 @@ def commit() -> str:
     return "" if answer.startswith(f"{release}-0-g") and "." not in answer[len(release) :] else answer.split("-g")[-1]
 
 
-# File of a wheel, next to the package's other files.
+# File in a wheel that contains the commit, next to the other files of the package.
 COMMIT_FILE = "commit.txt"
 
-# A checkout is also not a release if Git is not installed, or does not trust its folder.
+# Commit of a checkout if Git is not installed or does not trust its folder. Such a checkout is not treated as a
+# release.
 UNKNOWN = "unknown"
 
 
@@ -74,12 +76,12 @@ def utc_now() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return versions by name. "not installed" for a missing package."""
+    """Return the versions of this program, Python and the libraries by name, "not installed" for a missing library."""
     return {"aerpaw-cmp": tool_version(), **library_versions()}
 
 
 def library_versions() -> dict[str, str]:
-    """Return the versions of Python and the libraries."""
+    """Return the versions of Python and of the libraries by name."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 

@@ -1,16 +1,17 @@
-"""Reading of YAML files as checked settings. Every mistake becomes one message with its line and its fix.
+"""Reading of YAML files as checked settings. The message about each mistake contains its line and how to fix it.
 
 ``load_yaml(path, Model)`` is the only entry point. A model is a pydantic class, usually a :class:`StrictModel`.
 
-YAML is read by the core schema of YAML 1.2, because 1.1 (PyYAML's default) turns ``11:48:16`` into the number 42496 and
-``no`` into False, and reads ``1e6`` as text. No tag creates an object. Duplicate keys, several documents, aliases that
-expand to more than :data:`_MAX_NODES` nodes and nesting deeper than :data:`_MAX_DEPTH` are refused.
+Values are read by the core schema of YAML 1.2, because YAML 1.1 (PyYAML's default) turns ``11:48:16`` into the number
+42496 and ``no`` into False, and reads ``1e6`` as text. Tags cannot create objects. Duplicate keys, several documents,
+aliases that expand to more than :data:`_MAX_NODES` nodes and nesting deeper than :data:`_MAX_DEPTH` are refused.
 
-Values of some keys can be edited in a YAML file: every other line, its comments and its order stay unchanged.
+The values of some keys can be edited in a YAML file: all other lines, the comments and the order stay unchanged.
 
 The module also lists the files that a settings file names. Such files are inputs, which no output may replace.
 
-There is no list of keys: every text that names an existing file counts, so that a new key is not forgotten.
+Every text that names an existing file counts as such a file. There is no list of keys, because a new key could be
+forgotten in it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from pydantic import BaseModel
 from .errors import InputError, UsageError
 from .files import read_bounded
 
-# Larger files are refused unread; a site with 100 000 single trees has about 6 MB.
+# Larger files [bytes] are refused without reading them. A site with 100 000 single trees has about 6 MB.
 MAX_BYTES = 32 * 1024 * 1024
 
 # Largest number of scalars, lists and mappings, with aliases expanded, as a limit against alias bombs.
@@ -66,8 +67,8 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 class StrictModel(pydantic.BaseModel):
     """The base class of all settings: no unknown keys, only finite numbers, and no change after loading."""
 
-    # Refuse NaN and infinity, because comparisons do not refuse NaN, and JSON has neither. Defer the build, so that the
-    # validators of all parts are built together on first use.
+    # Refuse NaN and infinity, because range checks by comparison accept NaN, and JSON has neither. Defer the build, so
+    # that the validators of all parts are built together on first use.
     model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True
     )
@@ -83,7 +84,7 @@ def nearest(name: object, choices: Iterable[str]) -> str | None:
     >>> nearest("zzz", ["flight"]) is None
     True
     """
-    # wrong case is the most common mistake
+    # ignore case, because wrong case is the most common mistake
     by_lower = {choice.lower(): choice for choice in choices}
     matches = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
     return by_lower[matches[0]] if matches else None
@@ -97,7 +98,7 @@ def nearest_zone(name: str) -> str | None:
     >>> nearest_zone("America/NewYork"), nearest_zone("new york"), nearest_zone("EDT")
     ('America/New_York', 'America/New_York', None)
     """
-    zones = available_timezones() if len(name) > 4 else ()  # abbreviations are similar to too many names
+    zones = available_timezones() if len(name) > 4 else ()  # not for abbreviations, which are similar to too many names
     if "/" in name:
         return nearest(name, zones)
     cities = {zone.rpartition("/")[2]: zone for zone in sorted(zones)}
@@ -132,16 +133,16 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
 def load_yaml_and_lines(path: str | Path, model: type[ModelT]) -> tuple[ModelT, LineOf]:
     """Return the settings of :func:`load_yaml`, and a function that returns the line of a key as ``("towers", "LW1")``.
 
-    Use it for checks that need more than the file, if their messages must contain the line.
+    Use this function for checks that need more than the file and whose messages contain the line of a key.
     """
     settings: tuple[ModelT, LineOf] = _known(_read_text(Path(path)), str(path), model)
     return settings
 
 
-# the text is an argument, so that an edited file is parsed again
+# the text is an argument of the cached function, so that an edited file is parsed again
 @lru_cache(maxsize=16)
 def _known(text: str, path: str, model: type[Any]) -> tuple[Any, LineOf]:
-    """Return settings and lines of a text, cached because one command, and each task of a campaign, requests them."""
+    """Return settings and lines of a text. Cached, because a command and each task of a campaign request them again."""
     document = _parse(text, path)
     return _checked(document, model, path), document.line
 
@@ -219,7 +220,7 @@ class _Document:
     lines: dict[Location, int] = field(default_factory=dict)
 
     def line(self, location: Location) -> int | None:
-        """Return the line of a location. Unknown last parts are ignored: pydantic inserts names of union members."""
+        """Return the line of a location. Unknown parts are ignored, because pydantic inserts names of union members."""
         known: Location = ()
         for part in location:
             if (*known, part) in self.lines:
@@ -286,7 +287,7 @@ class _Builder:
             self._fail(event, f"the file expands to more than {_MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
-        """Return the scalar, list or mapping that begins with an event. An alias can name it only after its end."""
+        """Return the scalar, list or mapping that begins with an event. Its anchor is known only after its end."""
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._fail(event, f"the alias '*{event.anchor}' names no anchor above it, or contains itself")
@@ -328,7 +329,7 @@ class _Builder:
         return content
 
     def _key(self, event: Any) -> str:
-        """Return a key as text: 'on', 1 or 1.5 is kept as written, because pydantic requires text."""
+        """Return a key as text. 'on', 1 or 1.5 is returned as written, because pydantic requires text."""
         if isinstance(event, yaml.CollectionStartEvent):
             self._fail(event, "a list or mapping is used as a key")
         if isinstance(event, yaml.ScalarEvent) and event.value == "<<" and event.implicit[0]:
@@ -343,7 +344,7 @@ class _Builder:
     def _scalar(self, event: Any) -> Any:
         if event.tag not in (None, "!", _TAG + "str"):
             self._fail(event, f"the tag '{event.tag.replace(_TAG, '!!')}' is not allowed")
-        # a scalar with the tag !!str, in quotes or in a block is text
+        # a scalar is text if it has the tag !!str, is in quotes or is a block
         is_text = event.tag is not None or not event.implicit[0]
         return event.value if is_text else _plain_value(event.value)
 
@@ -352,7 +353,7 @@ def _plain_value(text: str) -> Any:
     """Return the value of an unquoted scalar by the core schema of YAML 1.2."""
     if text in _WORDS:
         return _WORDS[text]
-    # Python takes quadratic time for long integers and refuses them from 4 300 digits on: they become floats
+    # read long integers as floats, because Python takes quadratic time for them and refuses them from 4 300 digits on
     if _INT.match(text) and len(text) < 40:
         return int(text)
     if _HEX.match(text) and len(text) < 40:
@@ -369,7 +370,7 @@ def _explain(
     error: pydantic.ValidationError, model: type[pydantic.BaseModel], document: _Document, path: str | Path | None
 ) -> UsageError:
     if (kind := _kind(document.value)) and kind != _kind(_field_names(model)):
-        # suggesting near names is not useful if all names are unknown
+        # do not suggest similar names, because all names are those of another kind of file
         return UsageError(f"these are the settings of a {kind}", expected=_keys_of(model), path=path)
     findings: list[tuple[int | None, str, str | None]] = []
     for item in error.errors(include_url=False):
@@ -384,7 +385,7 @@ def _explain(
         f"line {line}: {problem}" + (f" ({cause})" if cause else "") if line else problem
         for line, problem, cause in findings
     ]
-    # a file of another kind has hundreds of mistakes
+    # limit the list, because a file of another kind has hundreds of mistakes
     shown = lines[:20] + ([f"and {len(lines) - 20} more"] if len(lines) > 20 else [])
     return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
 
@@ -402,7 +403,7 @@ def _kind(keys: Iterable[str]) -> str | None:
     return next((kind for kind, signs in _SIGNS.items() if signs.issubset(keys)), None)
 
 
-# Parts of a location that name the tried member of a union. No key of this package has such a name.
+# Parts of a location that name the member of a union that pydantic tried. No key of this package has such a name.
 _MEMBER = re.compile(r"literal\[.*\]|(constrained-)?float|int|str|bool")
 
 # The expected value in words, by pydantic's name of the error.
@@ -420,11 +421,11 @@ _KINDS = {
 
 
 def expectation(item: Any) -> str:
-    """Return what a finding of pydantic expects, as words that follow "expected"."""
+    """Return the value that an error of pydantic expects, as text that can follow "expected"."""
     message = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
     for kind, words in _KINDS.items():
         message = words.format(**item.get("ctx", {})) if re.fullmatch(kind, item["type"]) else message
-    return re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # write members of an Enum as in the file
+    return re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # write members of an Enum as they are written in the file
 
 
 def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | None]:
@@ -450,7 +451,7 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
 
 
 def _homes(model: type[pydantic.BaseModel], key: object, above: str = "") -> Iterator[str]:
-    """Yield a description of each part of a file that has a key of this name."""
+    """Yield a description of each part of a settings file that can contain a key of this name."""
     for name, info in model.model_fields.items():
         path, kind = f"{above}{name}", typing.get_origin(info.annotation)
         inner = {list: "a line of '{}:'", dict: "an entry of '{}:'"}.get(kind, "'{}:'") if kind else "'{}:'"
@@ -497,7 +498,7 @@ def edited(text: str, changes: Mapping[KeyPath, Any]) -> str:
     text : str
         Text of a mapping.
     changes : mapping of tuple of str to value
-        Plain values by the keys that lead to them.
+        New plain values, by the path of keys that leads to each of them.
 
     Raises
     ------
@@ -515,7 +516,7 @@ def edited(text: str, changes: Mapping[KeyPath, Any]) -> str:
             wanted = _put(wanted, path, value)
             new = _edited(new, path, value)
         alone = yaml.safe_load(new) == wanted
-    except yaml.YAMLError:  # an anchor was removed, but its alias remains
+    except yaml.YAMLError:  # the error of an alias whose anchor was removed
         alone = False
     if not alone:
         keys = ", ".join(".".join(path) for path in changes)
@@ -541,7 +542,7 @@ def _edited(text: str, path: KeyPath, value: Any) -> str:
         at = keys.index(key)
         if depth < len(path) - 1:
             node = node.value[at][1]
-    # a block that loses its last key would read as null
+    # write {} for a mapping that loses its last key, because an empty block would be read as null
     if value is None and len(keys) == 1 and depth:
         return _edited(text, path[:-1], {})
     if value is None:
@@ -559,7 +560,7 @@ def _flow(value: Any) -> str:
 
 
 def _span(text: str, node: Any) -> tuple[int, int]:
-    """Return the first and last character of a value. A block ends with its last line that is not a comment."""
+    """Return the range of characters of a value. A block ends with its last line that is not a comment."""
     start, end = node.start_mark.index, node.end_mark.index
     lines = text[start:end].splitlines(keepends=True)
     while len(lines) > 1 and (not lines[-1].strip() or lines[-1].lstrip().startswith("#")):
@@ -600,7 +601,7 @@ def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str,
     """Yield dotted key, text and path of every value that names a file."""
     for key, text in _texts(content, ""):
         for root in roots:
-            # most names do not exist, and creating a Path is slow
+            # do not create a Path first, because this is slow and most texts do not name a file
             if os.path.isfile(os.path.join(root, text)):  # noqa: PTH113, PTH118  never raises
                 yield key, text, root / text
                 break

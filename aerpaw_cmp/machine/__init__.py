@@ -1,1 +1,1 @@
-"""Checks whether this machine is ready."""
+"""Checks whether this machine can run this program."""

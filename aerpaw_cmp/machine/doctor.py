@@ -1,6 +1,7 @@
-"""Checks whether this machine is ready. Each check reports its finding and, if there is a problem, how to fix it.
+"""Checks whether this machine can run this program. Each check reports what it found, and how to fix a problem.
 
-The checks do not change the machine. ``tools/setup_llvm.py``, which ``make setup`` runs, does.
+The checks do not change the machine. Missing LLVM libraries are set up by ``tools/setup_llvm.py``, which ``make setup``
+runs.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from ..propagation.compiled import thread_count
 
 Status = Literal["ok", "warn", "fail"]
 
-# Memory that a report needs: a report of 10 000 poses and 5 towers stays below this.
+# Memory that a report needs. A report of 10 000 poses and 5 towers uses less than this.
 _MEMORY_NEEDED_BYTES = 2 * 1024**3
 
-# Disk space for reports, flight files and the path cache of a day in the field.
+# Disk space for the reports, flight files and cached paths of one day in the field.
 _DISK_NEEDED_BYTES = 1024**3
 
 
@@ -41,9 +42,10 @@ class Check:
     name : str
         Name of the check.
     status : {"ok", "warn", "fail"}
-        ``warn``: jobs that need this part are slow or refused, and all other jobs run. ``fail``: a command cannot run.
+        ``warn``: commands that need this part are slow or refused, and all other commands run. ``fail``: a command
+        cannot run.
     found : str
-        Finding of the check.
+        What the check found.
     remedy : str
         How to fix the problem. Empty if ``ok``.
     """
@@ -57,9 +59,9 @@ class Check:
 def checks() -> list[Check]:
     """Return all checks, in the order in which a new user needs them. The test of LLVM takes some seconds."""
     gpu = _gpu_check()
-    # Dr.Jit is only installed with Sionna RT, and only Dr.Jit uses LLVM
+    # check LLVM only if Dr.Jit is installed, which comes with Sionna RT, because only Dr.Jit uses LLVM
     compilers = list(llvm_checks()) if versions.version("drjit") != versions.NOT_INSTALLED else []
-    if "tested" in gpu.found and gpu.status == "ok":  # LLVM is not needed if a GPU works
+    if "tested" in gpu.found and gpu.status == "ok":  # failures of LLVM are warnings if a GPU works
         compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
     return [
         Check("Python", "ok", f"{platform.python_version()} ({sys.executable})"),
@@ -81,7 +83,7 @@ def as_dict(checks: Sequence[Check]) -> dict[str, Any]:
 
 
 def ready(checks: Sequence[Check]) -> bool:
-    """Check whether no check failed (warnings are allowed)."""
+    """Return True if no check failed. Warnings are allowed."""
     return all(check.status != "fail" for check in checks)
 
 
@@ -93,7 +95,7 @@ def package_checks() -> Iterator[Check]:
     pins: dict[str, str] = {}
     missing: Status = "warn" if versions.version("sionna-rt") == versions.NOT_INSTALLED else "fail"
     with suppress(metadata.PackageNotFoundError):
-        # read the pins of the installed sionna-rt: another version of it pins other versions of Mitsuba and Dr.Jit
+        # read the pins of the installed sionna-rt, because its versions pin different versions of Mitsuba and Dr.Jit
         for requirement in metadata.requires("sionna-rt") or []:
             # a requirement without an exact version results in an empty pin, which every version satisfies
             name, _, exact = requirement.partition("==")
@@ -111,7 +113,7 @@ def package_checks() -> Iterator[Check]:
 
 
 def llvm_checks() -> Iterator[Check]:
-    """Test libraries in child processes until one works, with one check per library."""
+    """Test LLVM libraries in child processes until one works, and yield one check per library."""
     try:
         trials = llvm.first_that_works(llvm.candidates())
     except AerpawCmpError as error:
@@ -134,7 +136,7 @@ def llvm_checks() -> Iterator[Check]:
 
 def _gpu_check() -> Check:
     """Check which Mitsuba variant Sionna RT would use. A GPU is tested in a child process, like LLVM."""
-    # a container may have the driver without its command line tool
+    # also look for the driver itself, because a container may have the driver without its command-line tool
     if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
         return Check("GPU", "ok", "none found: Sionna RT uses llvm_ad_mono_polarized")
     trial = llvm.try_variant("cuda_ad_mono_polarized")
@@ -148,13 +150,13 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
     """Return the available memory: the kernel's estimate, or the limit of the control group if it is lower."""
     try:
         lines = (root / "proc/meminfo").read_text().splitlines()
-        # not MemFree, because the kernel frees its file cache on demand
+        # do not use MemFree, because the kernel also frees memory of its file cache on demand
         available = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration, ValueError, IndexError):
         return None
     group = root / "sys/fs/cgroup"
     with suppress(OSError, ValueError):  # without a control group, the memory of the machine is the limit
-        # names of control groups of version 2; version 1 is not read
+        # files of control groups of version 2; control groups of version 1 are not read
         limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
         if limit != "max":
             available = min(available, int(limit) - int(used))
@@ -184,11 +186,11 @@ def _disk_check(folder: Path) -> Check:
 def cache_check(folder: Path) -> Check:
     """Check whether the folder of cached paths and kernels can be written to."""
     remedy = "set AERPAW_CMP_CACHE to a folder that you may write to"
-    # before the first run the folder does not exist: check its nearest parent
+    # check the nearest existing parent, because the folder does not exist before the first run
     existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
     if not existing.is_dir():
         return Check("Cache", "warn", f"{existing} is not a folder", remedy)
-    # files cannot be created in a folder without the right to enter it, even if it is writable
+    # also check the right to enter the folder, because files cannot be created without it
     if not os.access(existing, os.W_OK | os.X_OK):
         return Check("Cache", "warn", f"{folder} cannot be written to", remedy)
     return Check("Cache", "ok", str(folder))
@@ -202,7 +204,7 @@ def readers_check() -> Check:
         names = [reader.name for reader in catalogue()]
     except AerpawCmpError as error:
         return Check("Readers", "fail", str(error), "make setup")
-    except Exception as error:  # a reader of another package may raise any exception on import
+    except Exception as error:  # the import of a third-party reader may raise any exception
         return Check("Readers", "fail", f"{type(error).__name__} while loading them: {error}", "make setup")
     return Check("Readers", "ok", f"{len(names)}: {', '.join(names)}")
 
@@ -222,7 +224,7 @@ def serial_checks() -> Iterator[Check]:
             found = "is not installed" if isinstance(error, ModuleNotFoundError) else f"cannot be loaded ({error})"
             yield Check("Serial", "fail", f"pyserial {found}", "make setup")
         return
-    # ignore ttyS*: these ports of the main board are listed even if no device is plugged in
+    # ignore ttyS*, because these ports of the main board are listed even if no device is plugged in
     ports = sorted(port for port in list_ports.comports() if port.vid is not None or "ttyS" not in port.device)
     if not ports:
         yield Check("Serial", "ok", "no USB serial port: plug the modem in to use 'aerpaw-cmp tap'")
@@ -231,19 +233,19 @@ def serial_checks() -> Iterator[Check]:
 
 
 def serial_check(device: str, description: str = "") -> Check:
-    """Check whether this user may open a port, and whether it is free. Only root sees programs of other users."""
+    """Check whether this user may open a port, and whether it is in use. Only root sees the programs of other users."""
     from ..live.ports import holders  # needs termios
 
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
-        # membership of a new group starts with the next login
+        # the remedy includes a login, because membership of a group starts with the next login
         group = "dialout"
         with suppress(OSError, KeyError, NotImplementedError):
             group = Path(device).group()  # dialout on Debian, uucp on Arch
         remedy = f"sudo usermod -aG {group} $USER, then log in again"
         return Check("Serial", "warn", f"{port}: not allowed", remedy)
     if busy := [f"{holder.name} ({holder.pid})" for holder in holders(Path(device), others_only=False)]:
-        # ModemManager opens every port of a new modem automatically, and reads the answers to our commands
+        # ModemManager opens every port of a new modem automatically, and would read the answers to our commands
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"
         return Check("Serial", "warn", f"{port}: held by {', '.join(busy)}", stop)
     return Check("Serial", "ok", port)

@@ -1,7 +1,7 @@
 """Read AERPAW field logs, replay the flight by ray tracing, and compare measured and replayed levels and ranks.
 
-The names below are stable (docs/api.md); everything else may change. Importing this package is fast, because each name
-is imported when it is first used.
+The public names below are stable (docs/api.md). All other names may change. Importing this package is fast, because
+each name is imported when it is first used.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Entry point of the command line. It prints ``--help`` from a table, and :mod:`aerpaw_cmp.cli` runs all commands.
+"""Entry point of the command line. It prints ``--help`` itself, and :mod:`aerpaw_cmp.cli` runs all commands.
 
-This is the only place where an exception becomes a message and an exit code:
+Only this module turns exceptions into messages and exit codes:
 
 ====  ==========================================================
 0     done
@@ -29,19 +29,21 @@ OUTPUT_FAULT = 3
 BROKEN_PIPE = 141
 # A shell sets this variable to request completions of the command line.
 _COMPLETE = "_AERPAW_CMP_COMPLETE"
-# With this variable, Typer takes the shell from the command line instead of the parent process (which may not exist).
+# With this variable, Typer reads the name of the shell from the command line instead of from the parent process, which
+# may not be a shell.
 _SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
 ISSUES = "the project's issue tracker"
-# Limits on the threads of BLAS. The program solves many small systems, for which several threads wait for each other
-# (3.6 times the processor time for the sample report). Values that the user has set are not changed.
+# Variables that limit the threads of BLAS. The program solves many small systems, for which several threads would wait
+# for each other: the sample report would take 3.6 times the processor time. Values that the user has set are not
+# changed.
 BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-# Errors that methods of pathlib, such as ``is_dir``, raise for invalid paths.
+# Errors that methods of pathlib, such as ``is_dir``, raise for paths that cannot be used.
 _UNUSABLE = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENOTDIR, errno.EIO, errno.ESTALE)
 LONGEST_NAME = 120
 
-# Number of new objects after which Python searches for cycles (700 by default). A report creates a million objects and
-# keeps most of them.
+# Number of new objects after which Python searches for reference cycles. With the default of 700, Python would search
+# often and find little, because a report creates a million objects and keeps most of them.
 NEW_OBJECTS = 10_000
 
 
@@ -117,7 +119,7 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
         step = next_step(error, arguments)
         return f"{text}{gap}Next: {step}" if step else text, error.exit_code
     if callable(wording := getattr(error, "format_message", None)):
-        # a wrong option or argument; recognised by its method, because typer may contain its own copy of click
+        # a wrong option or argument. Recognise it by its method, because typer may contain its own copy of click.
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "aerpaw-cmp"
         return f"{command}: {wording().rstrip('.')}; '{command} --help' lists the options", 2
@@ -168,7 +170,7 @@ def main(arguments: list[str] | None = None) -> int:
     int
         The exit code. Exceptions are caught here.
     """
-    own_process = arguments is None  # NumPy is not loaded yet
+    own_process = arguments is None  # NumPy is not loaded yet, so its threads can still be limited
     if own_process:
         for name in BLAS:
             os.environ.setdefault(name, "1")
@@ -189,9 +191,9 @@ def main(arguments: list[str] | None = None) -> int:
 
                 code = cli.main(arguments)
                 if code == SIGNALLED + signal.SIGINT:
-                    interrupts.raise_interrupt()  # typer returns this code for an interrupt while it parsed arguments
+                    interrupts.raise_interrupt()  # typer returns this code if it was interrupted while parsing
     except KeyboardInterrupt as interrupt:
-        exec("")  # after an interrupt in exec(), CPython would end by the signal instead of with code 130
+        exec("")  # otherwise, after an interrupt in exec(), CPython would end by the signal instead of with code 130
         code = _interrupted(interrupt)
     except Exception as error:
         code = _failed(error, debug, arguments)
@@ -210,7 +212,7 @@ def _interrupted(interrupt: KeyboardInterrupt) -> int:
 
 
 def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
-    if type(error).__name__ == "Abort":  # click raises Abort for a Ctrl-C at a prompt
+    if type(error).__name__ == "Abort":  # click raises Abort for Ctrl-C at a prompt
         return SIGNALLED + signal.SIGINT
     if debug:
         import traceback
@@ -226,7 +228,7 @@ def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
 def _code_of_output(code: int) -> int:
     """Return the exit code after flushing standard output.
 
-    Without the flush, a failed write would appear only at exit.
+    Without this flush, a failed write would be noticed only when the process exits.
     """
     fault = interrupts.output_fault()
     if fault is None or code:

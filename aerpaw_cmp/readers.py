@@ -1,8 +1,8 @@
-"""Names that a reader of a log format needs, in this repository or in a separate package: docs/adding_a_reader.md.
+"""The names that a reader of a log format uses, in this repository or in a separate package (docs/adding_a_reader.md).
 
-A format of lines is a regular expression and the streams of its columns (:func:`text_reader`); any other format is a
-pair of functions ``sniff(head)`` and ``read(data, options)`` in a :class:`Reader`. The package of a reader declares the
-reader under the entry-point group ``aerpaw_cmp.readers``.
+For a format of text lines, a reader consists of a regular expression and the streams of its columns
+(:func:`text_reader`). For any other format, a reader is a :class:`Reader` with two functions, ``sniff(head)`` and
+``read(data, options)``. The package of a reader declares the reader under the entry-point group ``aerpaw_cmp.readers``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""The command line: arguments, exit codes and progress. No other package prints.
+"""The command line: arguments, exit codes and progress. No other subpackage prints.
 
-There is a module per group of commands. :mod:`aerpaw_cmp.cli.app` describes how to add a command.
+Each group of commands has a module in :mod:`aerpaw_cmp.cli.commands`. :mod:`aerpaw_cmp.cli.app` describes how to add a
+command.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ GROUPS = (logs, flight, reports, planning, live, site, machine)
 
 @cache
 def _program() -> Any:
-    """Return the commands as a click program, cached because building it takes 50 ms."""
+    """Return the commands as a click program. Cached, because creating it takes 50 ms."""
     return typer.main.get_command(app)
 
 
 def _refused(error: Any) -> UsageError:
-    """Return the usage error of a wrong option or argument, with the first example of the command."""
+    """Return the UsageError for a wrong option or argument, with the first example of the command."""
     text = str(error.format_message()).replace("Value error, ", "").replace("Input should be ", "expected ")
     command = getattr(getattr(error, "ctx", None), "command", None)
     _, _, examples = (getattr(command, "epilog", None) or "").partition("Examples:\n  ")
@@ -41,16 +42,16 @@ def main(arguments: list[str]) -> int:
     """
     say.quiet = say.as_json = False
     try:
-        # standalone mode would print errors and exit
+        # do not use standalone mode, which would print errors and exit
         result = _program()(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
     except Interrupted as interrupted:
         raise interrupted.error from None
     except typer.Abort as error:
-        if isinstance(error.__cause__, EOFError):  # the end of the input at a prompt, although no command has a prompt
+        if isinstance(error.__cause__, EOFError):  # raised by a command, because no command has a prompt
             raise error.__cause__ from None
         raise KeyboardInterrupt from error
     except Exception as error:
-        # typer may contain its own click, so test the attributes of a usage error, not its module
+        # test the attributes of a usage error instead of its class, because typer may contain its own copy of click
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
             raise _refused(error) from error
         raise

@@ -1,10 +1,10 @@
-"""The command-line app, and the options that its commands share.
+"""The command-line application, and the options that its commands share.
 
 A command is a function in a module of this package::
 
     @command("diff", examples=["aerpaw-cmp diff reports/a reports/b"])
     def diff(first: Annotated[Path, Argument(help="...")], strict: bool = False) -> int:
-        from ..jobs.diff_reports import run_diff  # here, so that help and completion load no job
+        from ..jobs.diff_reports import run_diff  # here, so that help and completion do not load the job
 
 and a line of help in :data:`aerpaw_cmp.common.text.COMMANDS`. The function returns the exit code, or None for 0. The
 decorator adds ``-h``, ``--json``, ``--quiet`` and the examples below the options. :func:`.answered` prints the JSON
@@ -33,7 +33,7 @@ from .shown import print_plan, say
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
-# no rich markup, because "[default: ...]" is text; no pretty exceptions, because __main__ turns them into messages
+# no rich markup, which would hide "[default: ...]"; no pretty exceptions, as __main__ turns exceptions into messages
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, context_settings=_SETTINGS
 )
@@ -63,11 +63,12 @@ Quiet = Annotated[bool, Option("-q", "--quiet", help="Print only results, warnin
 
 
 def output(text: str, metavar: str = "DIR") -> Any:
-    """Return the option for the output folder or file, with ``text`` as its help, which states the default."""
+    """Return the option for the output folder or file. ``text`` is its help, which states the default."""
     return Option("-o", "--out", metavar=metavar, help=text)
 
 
-# Options that several commands have, by the field of :class:`~aerpaw_cmp.jobs.options.RunOptions` that they set.
+# Options that several commands share, by the name of the field of :class:`~aerpaw_cmp.jobs.options.RunOptions` that
+# each option sets.
 _OF_RUN = {
     "logs_root": LogsRoot,
     "workers": Annotated[int, Option(min=1, help="Number of local workers that share the tasks.")],
@@ -100,15 +101,16 @@ def command(
     ----------
     name : str
     examples : sequence of str
-        Complete command lines, shown below the options and parsed by a test.
+        Complete command lines, which are shown below the options. A test checks that they can be parsed.
     of : typer.Typer
-        The app to which the command is added: the program, or a group such as ``site_app``.
+        The application to which the command is added: the program, or a group such as ``site_app``.
     text : str, optional
         One line of help. The default is the line in :data:`aerpaw_cmp.common.text.COMMANDS`.
     kind : type, optional
-        Class that reads the arguments.
+        Class that parses the arguments. The default is typer's class.
     options : mapping, optional
-        Result of :func:`of_run`. The function receives their values as its argument ``options``.
+        Options of the command, from :func:`of_run`. Their values are passed to the function as its argument
+        ``options``.
     """
     epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in examples)
     register = of.command(name, cls=kind, help=COMMANDS[name] if text is None else text, epilog=epilog)
@@ -121,7 +123,7 @@ def command(
 
 
 class Interrupted(BaseException):
-    """An interruption of a command, whose ``error`` contains the message about stored results."""
+    """An interrupt of a command. Its ``error`` contains the message about stored results."""
 
     def __init__(self, error: KeyboardInterrupt) -> None:
         super().__init__(str(error))
@@ -129,20 +131,20 @@ class Interrupted(BaseException):
 
 
 def _bare(hint: Any) -> Any:
-    """Return a type hint without the ``Optional`` that Python 3.10 adds to options whose default is None."""
+    """Return a type hint without the ``Optional`` that Python 3.10 adds to parameters whose default is None."""
     inner = get_args(hint)[:1]
     return inner[0] if get_origin(hint) is Union and get_origin(inner[0]) is Annotated else hint
 
 
 def _with_common_options(function: Callable[..., Any], of_run: Mapping[str, Any]) -> Callable[..., Any]:
-    """Add ``--json``, ``--quiet`` and the options of :func:`of_run` to a command. Let interrupts reach ``cli.main``."""
+    """Add ``--json``, ``--quiet`` and the options of :func:`of_run` to a command. Pass interrupts to ``cli.main``."""
 
     @functools.wraps(function)
     def run(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> Any:
         say.as_json, say.quiet = as_json, quiet
         for option, value in arguments.items():
             for number in value if isinstance(value, (list, tuple)) else (value,):
-                # click accepts nan, because nan is never outside a minimum or maximum
+                # refuse nan here: click accepts it, because nan is neither below a minimum nor above a maximum
                 if isinstance(number, float) and not math.isfinite(number):
                     raise UsageError(f"--{option.replace('_', '-')} {number}", expected="a finite number")
         if of_run:
@@ -156,7 +158,7 @@ def _with_common_options(function: Callable[..., Any], of_run: Mapping[str, Any]
         except KeyboardInterrupt as error:
             raise Interrupted(error) from None  # typer would turn a KeyboardInterrupt into a silent exit code
 
-    # resolve annotations here, because typer would evaluate these texts in its own module
+    # resolve annotations, which are texts, here, because typer would evaluate them in its own module
     hints = {name: _bare(hint) for name, hint in get_type_hints(function, include_extras=True).items()}
     added = {**of_run, "as_json": Json, "quiet": Quiet}
     hints |= added

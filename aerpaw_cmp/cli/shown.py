@@ -1,4 +1,4 @@
-"""Output of the commands: progress, tables, JSON."""
+"""Output of the commands: progress, tables and JSON."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _EVERY_S = 30.0
 
 
 def show(text: object, *, to_stderr: bool = False) -> None:
-    """Print lines on standard output or error, with control characters of file contents escaped."""
+    """Print lines on standard output or error, with control characters escaped, because they may come from a file."""
     print(printable(str(text)), file=sys.stderr if to_stderr else sys.stdout, flush=True)
 
 
@@ -26,8 +26,8 @@ class ProgressLines:
     """Progress on standard error, so that standard output contains only results.
 
     On a terminal, progress is a bar with the remaining time. Elsewhere, a line is printed at each quarter and every
-    half minute. Text after a tab may change while the same progress is shown. If ``quiet`` is set, only :meth:`warn`
-    prints. If ``as_json`` is set, standard output contains one JSON object.
+    half minute. Text after a tab is a remark, which may change without starting another bar. If ``quiet`` is set, only
+    :meth:`warn` prints. If ``as_json`` is set, standard output contains one JSON object.
     """
 
     def __init__(self) -> None:
@@ -38,12 +38,12 @@ class ProgressLines:
         self.quiet = self.as_json = False
 
     def __call__(self, text: str, fraction: float | None = None, /) -> None:
-        """Show a line of text, or the progress if ``fraction`` (0 to 1) is given."""
+        """Show a line of text, or progress if the share ``fraction`` (0 to 1) is given."""
         if self.quiet:
             return
         if fraction is None:
             self.warn(text)
-        elif self._bar is not None or sys.stderr.isatty():  # rich 13.7 hides the terminal while it shows a bar
+        elif self._bar is not None or sys.stderr.isatty():  # while rich 13.7 shows a bar, isatty() is False
             self._draw(text, fraction)
         else:
             name, _, tail = text.partition("\t")
@@ -70,7 +70,7 @@ class ProgressLines:
             self.end()
 
     def end(self) -> None:
-        """Stop the progress bar and leave it on the terminal as it is."""
+        """Stop the progress bar. Its last state remains on the terminal."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
@@ -112,7 +112,7 @@ SCHEMA = 1
 def answered(value: dict[str, Any]) -> bool:
     """Print a JSON object with its schema version if ``--json`` is set, and return whether it was printed."""
     if say.as_json:
-        # JSON has no NaN, and browsers refuse it, so callers replace it by null
+        # refuse NaN, which JSON does not have and browsers do not read; callers replace it by null
         print(json.dumps({"schema": SCHEMA, **value}, indent=1, allow_nan=False), flush=True)
     return say.as_json
 
@@ -133,23 +133,24 @@ def print_files(paths: Sequence[Path]) -> None:
             show(path)
 
 
-# Columns up to this width (numbers, times) are not wrapped.
+# Columns up to this width, such as numbers and times, are not wrapped [characters].
 _FIXED = 20
 
 
 def table(columns: list[str], rows: list[list[str]], title: str | None = None, width: int | None = None) -> None:
-    """Print a table, or a paragraph per row if the terminal is too narrow."""
+    """Print a table, or one paragraph per row if the terminal is too narrow for a table."""
     from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
 
-    # escape before widths are measured, because an escape is longer than the character
+    # escape control characters before measuring widths, because an escape sequence is longer than its character
     rows = [[one_line(cell) for cell in row] for row in rows]
     columns, title = [one_line(name) for name in columns], title and one_line(title)
-    # without a terminal, rich uses 80 columns; it would read [words] in a log or a unit as styles
+    # set the width, because rich uses 80 columns without a terminal. Set markup=False, because rich would read [words]
+    # in a log or unit as styles.
     console = Console(width=width if width or sys.stdout.isatty() else 160, markup=False)
     needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
-    # 3 is the width of a border and a space on each side of a cell
+    # a border and a space on each side of a cell have a width of 3
     roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
     if sum(min(need, _FIXED) + 3 for need in needs) + 1 > console.width:
         _paragraphs(columns, rows, title, console.width)
@@ -182,7 +183,7 @@ def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, wi
         lines = [""]
         for name, cell in zip(columns[1:], row[1:], strict=True):
             item = f"{name} {cell}"
-            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # indent and separator need 7
+            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # indent and separator take 7 characters
                 lines.append("")
             lines[-1] += f" | {item}" if lines[-1] else item
         show(row[0])
@@ -203,8 +204,8 @@ def records(items: Sequence[Any], columns: Mapping[str, str], title: str | None 
     items : sequence
         One item per row.
     columns : mapping of str to str
-        Attribute of each column by heading: ``name``, ``name.part`` for a nested attribute, or ``name:.2f`` with a
-        format.
+        For each heading, the attribute that the column shows: ``name``, ``name.part`` for a nested attribute, or
+        ``name:.2f`` with a format.
     title : str, optional
         Line above the table.
     """

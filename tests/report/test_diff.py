@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.content import KEY
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
 from aerpaw_cmp.compare.statistics import pooled_difference
@@ -299,7 +300,8 @@ BAD = {
     "nothing": (shutil.rmtree, r"there is no such folder; expected the folder of a report", InputError),
     "a file": (lambda f: (shutil.rmtree(f), f.write_text("{}")), r"this is a file; expected the folder of a report", InputError),
     "another flight": (
-        lambda f: change_metrics(f, lambda m: m.update(flight="other", inputs=[])), r"different flights: \S+ and other", UsageError
+        lambda f: change_metrics(f, lambda m: m.update(flight="other", inputs=[m["inputs"][0] | {"sha256": "0" * 64}])),
+        r"different flights: \S+ and other", UsageError
     ),
 }  # fmt: skip
 
@@ -319,6 +321,12 @@ def test_what_is_no_report_is_one_message(name, pair, capsys):
 def test_a_renamed_flight_with_the_same_logs_is_the_same(pair):
     change_metrics(pair[1], lambda m: m.update(flight="renamed"))
     assert run_diff(*pair).differences == ()
+
+
+def test_links_that_the_flight_itself_taught_are_named(pair):
+    change_metrics(pair[1], lambda m: m["rss"]["LW1"]["USRP1"].update({KEY: ["0" * 64]}))
+    said = [text for text in run_diff(*pair).remarks if "learned from this flight's own log" in text]
+    assert [text.partition(": ")[2].partition(":")[0] for text in said] == ["LW1 USRP1"]
 
 
 def test_links_of_one_report_alone_are_named(pair):

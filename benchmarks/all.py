@@ -46,7 +46,6 @@ WARM = ["-c", "from aerpaw_cmp.propagation.compiled import why_missing\nwhy_miss
 
 # How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards.
 SMALLEST: dict[str, list[str]] = {
-    "aligned_paths": ["--links", "20"],
     "all": ["--only", "kriging", "--no-history"],
     "clock_power": ["sample_logs/UAV", "--quiet"],
     "country": ["--receivers", "1e3", "--workers", "1"],

@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 import shapely
@@ -38,9 +40,10 @@ def test_no_bounce_inside_a_building(scenes, source, target, expected):
 
 @pytest.mark.parametrize("boxes", [1, 2, 3, 4])
 def test_same_paths_as_rational_arithmetic_on_aligned_geometry(scenes, boxes):
+    """The number of scenes can be raised for a longer test, see docs/numerics.md."""
     rng = np.random.default_rng(boxes)
     touching = 0
-    for _ in range(12):
+    for _ in range(int(os.environ.get("AERPAW_CMP_EXACT_SCENES", "12"))):
         solids, source, targets = exact.random_scene(rng, boxes)
         footprints = [box(w, s, e, n) for w, e, s, n, _ in solids]
         touching += any(a.touches(b) for a in footprints for b in footprints)

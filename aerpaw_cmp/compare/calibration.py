@@ -174,7 +174,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: gains.GainModel 
         Residuals of the training flights relative to free space.
     recipe : Recipe
     model : GainModel, optional
-        Model whose strengths were already fitted to the same flights. By default they are fitted here.
+        Model whose strengths were already fitted to the same flights. By default, the strengths are fitted here.
     """
     names = ["uav", *dict.fromkeys(s.antenna for s in series)]
     patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
@@ -326,7 +326,7 @@ def flight_left_out(
 ) -> tuple[Score, ...]:
     """Score the prediction of each flight from other flights (:func:`groups_of`).
 
-    ``without`` receives the gains that were learned with each flight left out.
+    ``without`` receives, for each flight, the gains that were learned without this flight.
     """
     scores: list[Score | None] = []
     for group in groups_of(flights_of(observed)):
@@ -378,8 +378,8 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
 
-# Number of samples per series whose standard deviation is checked. Computing it takes a thousand times longer than a
-# mean.
+# Number of samples per series whose standard deviation is checked. Computing a standard deviation takes a thousand
+# times longer than computing a mean.
 _SPREAD_SAMPLES = 400
 
 
@@ -414,8 +414,8 @@ def spread_flights(flights: Sequence[str]) -> list[str]:
     return [flights[i] for i in spread_out(len(flights), _MOST_SCORED)]
 
 
-# ``parts(scored, other)`` returns for each part the samples (n,) of the scored series in it, and the samples (m,) of
-# another series that can be used for learning.
+# ``parts(scored, other)`` returns two masks for each part: the samples (n,) of the scored series that are in the part,
+# and the samples (m,) of another series that can be used for learning.
 Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
 
 
@@ -825,7 +825,8 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
         raise InputError("all samples are at one position, so no model can be tested", expected="a flight over an area")
     left_out = [s for fold in folds if fold.known for s in fold.left_out if np.isfinite(s.residual_db).any()]
     place = np.concatenate([np.zeros((0, 3)), *(s.binned(BIN_S).position_m for s in left_out)])
-    # scale standard deviations before scoring, so that the CRPS compares errors
+    # scale standard deviations before scoring, so that the CRPS compares errors and not standard deviations of the
+    # wrong size
     factors = {key: _sd_factor([s.flight for s in left_out], tallies[key]) for key in joined}
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}

@@ -395,10 +395,10 @@ def _holds_in_halves(models: Sequence[_Model], most: float) -> bool:
     return bool(after <= most**2 * before)
 
 
-# A gain is fitted to one half of the flight and tested on the other half, where it must reduce the RMSE at least to the
-# first of these shares of its value. The second share is used instead with learned antennas, or if the gain reduces the
-# RMSE of the complete flight at least to the third share. A gain is then plausible although it fits the other half less
-# well, because each half of a short flight contains few directions.
+# A gain is fitted to one half of the flight and tested on the other half, where the RMSE with the gain must be at most
+# the first share of the RMSE without it. The second share is used instead with learned antennas, or if the RMSE of the
+# complete flight with the gain is at most the third share of the RMSE without it. A gain is then plausible although it
+# fits the other half less well, because each half of a short flight contains few directions.
 _MOST_IN_HALVES, _MOST_OF_ERROR = (0.75, 0.85), 0.5
 # Number of consecutive means that count as one independent sample of the error. The two halves may contain different
 # directions, so the test of halves is skipped if the log odds per channel reach the second number. Even learned
@@ -643,7 +643,7 @@ def _likeliest(
 ) -> tuple[int, float]:
     """Return the index of the likeliest row of levels (m, n) under typically correlated noise, and the search cost.
 
-    The prior probability of each level is proportional to ``weight``. Levels that are not ``possible`` are not chosen.
+    The prior probability of each level is proportional to ``weight``. Rows that are not ``possible`` are not chosen.
     """
     error = e.measured_db - levels_db
     left = error[:, 1:] - _SEARCHED_PHI[1] * error[:, :-1]
@@ -684,7 +684,7 @@ def _log_likelihoods(e: LevelEvidence, trials: Sequence[Trial], at: NoiseParamet
 
 
 def _concentration(log_likelihood: FloatArray, width: FloatArray) -> float:
-    """Return the log of the ratio of the greatest to the mean likelihood. Each value is weighted by its width."""
+    """Return the log of the largest likelihood divided by the mean likelihood. The mean is weighted by ``width``."""
     top = log_likelihood.max()
     return -math.log(float(np.exp(log_likelihood - top) @ width / width.sum()))
 
@@ -731,7 +731,7 @@ def _heading(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
-    """Yield the trials that the attitude should be used although the settings ignore it, or the reverse."""
+    """Yield trials in which an attitude that the settings ignore is used, or an attitude that they use is ignored."""
     for mode, change in e.attitude_db.items():
         cost, sentence = 0.0, "the UAV's attitude is not used"
         if mode == "ignored":  # ignoring a logged attitude is the less likely remedy
@@ -762,7 +762,7 @@ _DRIFTS_M = tuple(float(sign * rise) for rise in (15, 20, 25, 30, 40, 50, 60, 80
 
 
 def _growing(e: LevelEvidence) -> FloatArray:
-    """Return the changes of the level (m, n) by a height error that grows from 0 to each of the drifts."""
+    """Return the changes of the level (m, n) by height errors that grow from 0 to each value of :data:`_DRIFTS_M`."""
     from scipy.ndimage import map_coordinates
 
     rises = np.array(sorted({0.0, *e.raised_db}))

@@ -45,7 +45,8 @@ Frame = Literal["body", "mast", "pair"]
 # Prior standard deviation of each offset in units of the noise: so large that the offset is practically free.
 _OFFSET_SD = 100.0
 
-# Largest number of means in a fit (a matrix of 72 MB). Many flights are averaged over longer times to stay below it.
+# Largest number of means in a fit (a matrix of 72 MB). Many flights are averaged over longer times to stay below this
+# number.
 MOST_ROWS = 3000
 
 # Candidate strengths of the tower's gains relative to the UAV's. The likelihood selects a factor. No other parameter is
@@ -1027,7 +1028,7 @@ class Evidence:
 
     @property
     def fits(self) -> bool:
-        """True if both log odds are sufficient for an airframe without the antenna of its tower."""
+        """True if both log odds are sufficient to use a learned airframe without a learned tower antenna."""
         return min(self.over_own, self.over_turned) >= LEAST_ODDS
 
 

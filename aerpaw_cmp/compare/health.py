@@ -30,7 +30,7 @@ _LEAST_SD_DB = 0.3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOut:
-    """The errors of one flight on one channel, which was predicted without that flight.
+    """The measured levels of one flight on one channel, and the levels that were predicted without this flight.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Noise:
 
 
 def binned(time_s: FloatArray, error_db: FloatArray, width_s: float = BIN_S) -> tuple[FloatArray, FloatArray]:
-    """Return times (m,) and means (m,) of the error over bins of time, after subtracting the mean."""
+    """Return times (m,) and means (m,) of the error over bins of time, minus their mean."""
     known = np.isfinite(error_db)
     time_s, error_db = time_s[known], error_db[known]
     if not len(time_s):

@@ -59,7 +59,7 @@ class ModelRow:
     difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
         RMSE minus the RMSE of the best model of the flight on the same samples [dB].
     n : int
-        Number of samples that all compared models share.
+        Number of samples for which all compared models have a level.
     seconds : float
         Time to compute the levels of the flight [s].
     recommended : bool

@@ -57,13 +57,13 @@ class RssComparison:
         Numbers of samples with a known pose that are out of coverage: in at least one of measurement and simulation, in
         the measurement (no signal), and in the simulation (no path).
     n_no_pose : int
-        Samples without a pose, which are not compared.
+        Number of samples without a pose, which are not compared.
     at_edge : bool
         True if the offset is at the edge of the search range.
     correlation : float
         Pearson correlation; NaN for constant series.
     intervals : ErrorIntervals
-        95 % intervals, and the correlation of the residual.
+        95 % intervals, and the number of independent samples.
     baselines : mapping of str to OffsetFit
         Simpler models such as free space and two-ray, each with its own offset, on the same pairs.
     baseline_intervals : mapping of str to (low, high)
@@ -868,7 +868,7 @@ def nearest_points(
     Parameters
     ----------
     position_m : (n, 3)
-        East, north, up of the samples. A sample with a NaN is not near any point.
+        East, north and up of the samples [m]. A sample with a NaN is not near any point.
     points_m : (points, 3)
         At least one.
     reach_m : float

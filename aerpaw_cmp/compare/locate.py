@@ -71,8 +71,9 @@ class LevelModel:
     Parameters
     ----------
     slope, slope_sd : float
-        Exponent of the distance. elevation_sd_db : float Standard deviation of the gain over elevation, from both
-        antennas and the ground.
+        Path-loss exponent: prior mean and standard deviation.
+    elevation_sd_db : float
+        Standard deviation of the gain over elevation, from both antennas and the ground.
     cases : tuple of Case
         Cases over which the evidence is averaged, by their weights.
     """
@@ -543,7 +544,7 @@ class NodeEstimate:
     height_m : (low, high)
         Range of possible heights.
     slope, slope_sd : float
-        Exponent of the distance and its standard deviation.
+        Path-loss exponent and its standard deviation.
     anywhere : float
         Log evidence of all positions within reach together.
     placed : bool

@@ -331,7 +331,7 @@ def k_curve(
     """
     grid = k_grid() if k is None else unmasked(k)
     ri, profile = _ranks(measured), unmasked(sigma)
-    # any value of K shows whether there is a channel
+    # use any K above 1 to find the samples with a channel, because their rank is at least 1 for every such K
     paired = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
     if not paired.any():
         return KCurve(k=grid, agreement=np.full(len(grid), np.nan))

@@ -2,7 +2,7 @@
 
 Neighbouring samples of a flight are correlated, and a single flight hardly determines the correlation time. Intervals
 of a mean, a power and a ratio of powers therefore average over many possible correlations. A sequence of samples is
-described by its slowest cosine terms (Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.00868.x): for a given
+described by its slowest cosine terms (Mueller and Watson 2008, doi:10.1111/j.1468-0262.2008.00868.x). For a given
 correlation, these terms are normally distributed with a known covariance. The assumed correlation times range from zero
 to three times the duration of the flight. The correlation functions over time are exponential, with and without white
 noise, or smooth (Matern 3/2). Correlations over position depend on the distance between two positions of the track.
@@ -16,8 +16,8 @@ the same way. Comparisons over all channels of a flight also estimate the correl
 (:class:`Channels`).
 
 Passes over the same positions are compared for every pair of flights. For 200 flights with ten links each, these are
-199 000 pairs of passes. The positions of a flight are therefore put into one k-d tree, pairs of flights whose bounding
-boxes do not overlap are not searched, and links that were sampled at the same positions share one search.
+199 000 pairs of passes. The positions of a flight are therefore put into one k-d tree, and links that were sampled at
+the same positions share one search. Pairs of flights whose bounding boxes do not overlap are not searched.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, Printe
 TERMS = 48
 _FEWER = np.array([9, 12, 16, 24, 34, TERMS])
 
-# Smallest number of samples for an interval.
+# Smallest number of samples for which an interval is computed.
 FEWEST = 20
 
 # Length of the sequence divided by its correlation length (exp(-rate) is the correlation of the two ends).
@@ -69,8 +69,8 @@ PLACE_WHITE = 0.002 * 2.0 ** np.arange(9)
 PLACE_FADING = (0.1, 0.25, 0.5, 0.75)
 _FADING_RATE = 40.0
 
-# For each kind of interval, the weight of a correlation over position relative to the mean weight of a correlation over
-# time, and the correlation length above which this weight falls as 1 / length. The cosine terms hardly distinguish such
+# For each kind of interval: weight of a correlation over position, relative to the mean weight of a correlation over
+# time, and correlation length above which this weight falls as 1 / length. The cosine terms hardly distinguish such
 # long correlations, but the intervals of means and powers depend on them. The values were found by simulation.
 # Differences of squares have half the correlation length of errors.
 _PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.12, 0.2), "influence": (0.07, 1.0)}
@@ -78,21 +78,21 @@ _PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.12, 0.2)
 # Largest number of positions from which the correlations of a track are computed.
 _THINNED = 400
 
-# Only correlation over time is used if more than this share of samples has no position, or if the RMS distance from the
-# centre of the track is below this [m]: the logged positions of a hover are noise.
+# Only correlation over time is used if more than this share of samples has no position. The same applies if the RMS
+# distance from the centre of the track is below this [m], because the logged positions of a hover are noise.
 _UNPLACED, _HOVER_M = 0.1, 15.0
 
 # Share of the second part in the two-part correlations of pooled channels. The second part is white or ten times faster
 # than the first part, because the correlations of the channels differ.
 _SECOND_PART = 0.3
 
-# Smallest rate of a correlation with white noise that pooled channels can reveal. At smaller rates, no term would
-# exceed the noise, but the mean would vary.
+# Smallest rate at which pooled channels can reveal a correlation that is mixed with white noise. At smaller rates, no
+# cosine term would exceed the noise, but the mean of the process would vary.
 _VISIBLE = 6.0
 
-# Number of bins of a pooled sequence for the terms of its channels, and standard deviation of the logarithm of the
-# ratio of the power of a sum of independent channels to the sum of their powers. The latter is 0.2 for a known
-# correlation.
+# Number of bins of a pooled sequence for the terms of its channels, and a standard deviation for independent channels.
+# It is that of the logarithm of a ratio: the power of the sum of the channels to the sum of their powers. For a known
+# correlation, it is 0.2.
 _BINS, _SUM_OF_POWERS = 1024, 0.3
 
 # File with the logarithms of the prior weights, in tenths, by kind, form (exponential with each white share, then
@@ -275,7 +275,7 @@ def _smooth(rate: float, terms: int) -> FloatArray:
     The process has the covariance (1 + rate |s - t|) exp(-rate |s - t|). The result follows from the derivative of
     :func:`_exponential` with respect to the rate.
     """
-    step = 1e-20  # a step along the imaginary axis: the derivative is exact to rounding
+    step = 1e-20  # a step along the imaginary axis, with which the derivative is exact to rounding
     covariance = _exponential(complex(rate, rate * step), terms)
     return np.asarray(covariance.real - covariance.imag / step)
 
@@ -418,7 +418,7 @@ def likelihoods(slow: FloatArray, parts: Sequence[CorrelationSet] = ()) -> tuple
     square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
     log_det = np.concatenate([part.log_det for part in parts])
     log = log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
-    # relative to the largest likelihood, because likelihoods exceed the range of floats
+    # divide by the largest likelihood, because likelihoods may exceed the range of floats
     return np.exp(log - log.max(axis=-1, keepdims=True)), square
 
 
@@ -525,9 +525,9 @@ def loud_part(values: FloatArray) -> tuple[float, float]:
     -------
     share, ratio : float
         Share of the samples in the loud parts, and the mean square of these samples divided by the mean square of all
-        other samples. 0 and 1 if the sequence is steady. At least two parts must be loud by two criteria: the mean
-        square of the errors, and the mean square of the innovations of a second-order autoregression, which are hardly
-        correlated.
+        other samples. 0 and 1 if the sequence is steady. At least two parts must have a large mean square of the
+        innovations of a second-order autoregression, which are hardly correlated. The mean square of the errors in
+        these parts must also be large.
     """
     away = values - values.mean()
     if len(away) < _FEWEST_FOR_PARTS or not away.any():
@@ -822,8 +822,8 @@ class PairedDifference:
         ``rmse_db - other_rmse_db`` [dB], negative if the first model is better.
     difference_ci95_db : (low, high)
         95 % interval of the difference [dB]. NaN if there is no interval. Also NaN if it contains 0 and is so wide that
-        one of the two RMSEs would be negative at one of its ends: the flight is then too short compared with the
-        correlation time of its errors.
+        one of the two RMSEs would be negative at one end. The flight is then too short compared with the correlation
+        time of its errors.
     standard_error_db : float
         Half of the width of the central 68 % interval of ``difference_db`` [dB], NaN if there is no interval.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
@@ -956,7 +956,7 @@ def pooled_difference(
     free_offset: bool = True,
     place_m: Sequence[FloatArray] | None = None,
 ) -> PairedDifference:
-    """Compare two models over all channels of a flight at once.
+    """Compare two models over all channels of a flight together.
 
     Parameters
     ----------
@@ -1204,7 +1204,7 @@ class _Prepared:
 def pass_pairs(
     passes: Sequence[Pass], *, cell_m: float, radius_m: float, heading_within_deg: float | None
 ) -> list[PassPair]:
-    """Return every pair of two flights' passes on one link, in the order of the first and then of the second pass.
+    """Return all pairs of passes of different flights on the same link, ordered by the first, then by the second pass.
 
     Parameters
     ----------

@@ -246,7 +246,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     Notes
     -----
     The interval uses Student's t for n flights. From :data:`_MANY_FLIGHTS` flights on, n is replaced by the number of
-    independent flights n (1 - r) / (1 + r), because consecutive flights can correlate. r is the correlation of
+    independent flights n (1 - r) / (1 + r), because consecutive flights can correlate. Here r is the correlation of
     consecutive flights, corrected for its bias of -(1 + 3 r) / n (Kendall 1954, doi:10.2307/2332720); a negative r
     counts as 0.
     """
@@ -277,7 +277,7 @@ def verdict_of(difference: MeanOfFlights) -> RankingVerdict:
     return "worse" if difference.low > 0 else "not significant"
 
 
-# Share of campaigns without a fault in which any cause is named.
+# Nominal share of campaigns without a fault for which a cause is named.
 _FALSE_ALARMS = 0.02
 
 # Smallest number of flights of a campaign in which one flight can be reported as different.
@@ -822,7 +822,7 @@ def stepped(node: str, night: Sequence[str], offsets: NightOffsets, nodes: int) 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Changed:
-    """A number in both reports: ``difference`` is second minus first, with a 95 % interval or NaN."""
+    """A number that both reports contain. ``difference`` is second minus first, with its 95 % interval, or NaN."""
 
     first: float
     second: float
@@ -951,7 +951,7 @@ def level_difference(
 
 
 def _common_differences(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the differences at samples that have both values."""
+    """Return second minus first at the samples for which both values are finite."""
     finite = np.isfinite(first) & np.isfinite(second)
     return np.asarray(second[finite] - first[finite], dtype=np.float64)
 

@@ -10,8 +10,8 @@ a signal arrives during such a call, a second thread ends the process.
 
 scancel, systemd and docker send SIGTERM, and a closed terminal sends SIGHUP. Both signals end a command as Ctrl-C does.
 
-Errors of a standard stream that is closed, or whose disk or reader is full or gone, are not reported as bugs of the
-program.
+A standard stream may be closed, its disk may be full, or its reader may have ended. Such errors are not reported as
+bugs of the program.
 
 The streams of a command store the first error of their descriptor and then discard output. :func:`output_fault` returns
 this error.

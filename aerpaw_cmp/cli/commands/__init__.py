@@ -1,1 +1,1 @@
-"""The commands, grouped by topic."""
+"""The commands of the program, in one module per topic."""

@@ -82,7 +82,8 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
     from ...compare.statistics import FEWEST
 
     channels = [m for channels in metrics["rss"].values() for m in channels.values()]
-    # if the antenna of a channel was learned on this log, the channel is deliberately not scored
+    # do not warn if the antenna of a channel was learned from this log, because such a channel is deliberately not
+    # scored
     most = max([m["n"] for m in (*channels, *metrics["rank"].values())], default=0)
     if most >= FEWEST or any(m.get("trained_on") for m in channels):
         return 0
@@ -92,14 +93,14 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
 
 
 def _verdict(outcome: Any, strict: bool) -> int:
-    """Warn about each failed check, and return 1 if a failed check makes the command fail."""
+    """Warn about each failed check. Return 1 if ``strict`` is set and a check failed, otherwise 0."""
     for check in outcome.failed_checks:
         say.warn(f"check failed: {check}")
     return 1 if strict and outcome.failed_checks else 0
 
 
 def _print_models(models: Sequence[Mapping[str, Any]]) -> None:
-    """Print one line per distinct model, over all channels. The page lists each channel separately."""
+    """Print a table of the distinct models with scores over all channels. The page also lists each channel."""
     notes = {"recommended": "recommended", "fastest_sufficient": "fastest sufficient"}
     rows = [{**row, "note": ", ".join(notes[key] for key in notes if row[key])} for row in models if row["distinct"]]
     columns = {
@@ -124,7 +125,7 @@ def _print_forecasts(rank: Mapping[str, Any]) -> None:
 
 
 def _print_report_summary(outcome: Any) -> None:
-    """Print the summary of the page first, then its tables."""
+    """Print the summary of the report's page, then its tables and warnings."""
     from ...compare.result import BASELINE_TITLE
     from ...compare.statistics import FEWEST
     from ...report.flight import prediction_card

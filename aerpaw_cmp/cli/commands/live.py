@@ -19,10 +19,10 @@ WEB = "127.0.0.1:8765"
 
 
 class WebCommand(TyperCommand):
-    """A command whose option ``--web`` may be given without an address."""
+    """A command with an option ``--web`` that may be used without an address."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Add the default address after ``--web`` if no address (with a colon, without a slash) follows."""
+        """Parse arguments, with the default address after ``--web`` if no address (a colon and no slash) follows."""
         words = []
         for index, word in enumerate(args):
             words.append(word)
@@ -94,7 +94,7 @@ def tap(
 
 
 class StatusLine:
-    """Show the status of the modems on standard error. On a terminal, each line overwrites the previous line."""
+    """The status line of the modems on standard error. On a terminal, each new status overwrites the previous one."""
 
     def __init__(self, enabled: bool) -> None:
         self._enabled, self._terminal = enabled, sys.stderr.isatty()
@@ -102,7 +102,7 @@ class StatusLine:
 
     @property
     def end(self) -> str:
-        """Return the text that ends the status line."""
+        """Return the text that ends the status line: a line break on a terminal, else empty."""
         return "\n" if self._terminal else ""
 
     def __call__(self, name: str, now: Any) -> None:
@@ -111,7 +111,7 @@ class StatusLine:
 
         head = f"{name}: " if name else ""
         if now.message:
-            # "\r\033[K": back to the beginning of the line, and clear it
+            # "\r\033[K" moves the cursor to the beginning of the line, and clears the line
             print(("\r\033[K" if self._terminal else "") + one_line(head + now.message), file=sys.stderr, flush=True)
         self._lines[name] = one_line(head + format_status(now))
         if self._enabled and self._terminal:
@@ -119,12 +119,12 @@ class StatusLine:
         elif self._enabled:
             print(self._lines[name], file=sys.stderr, flush=True)
         if now.alarm:
-            # the terminal's bell
+            # "\a" rings the terminal's bell
             print("\a", end="", file=sys.stderr, flush=True)
 
 
 def _needs_posix(command: str) -> None:
-    """Refuse a system without termios and fcntl, which open and lock ports."""
+    """Raise UsageError on a system without termios, fcntl and pty, which are needed to open and lock ports."""
     import importlib
 
     for name in ("fcntl", "termios", "pty"):

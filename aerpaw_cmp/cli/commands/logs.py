@@ -53,7 +53,7 @@ def ingest(
         raise UsageError("--site without --draft", expected="--draft FILE, because only a draft uses the site")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
-        # options take precedence over the mapping, which may contain the same keys (the number of rank 1)
+        # options take precedence over --map, which may set the same keys, such as the number of rank 1
         options = run.mapping(columns) | {key: value for key, value in options.items() if value is not None}
         reader = reader or "generic_csv"
     try:
@@ -71,7 +71,7 @@ def ingest(
         show(f"wrote {out}{several}")
     if draft is not None:
         for remark in summary["draft"]:
-            # remarks about a line to check or a skipped log are warnings, which --quiet shows, too
+            # all other remarks, about a line to check or a skipped log, are warnings, which are also shown with --quiet
             (say if remark.endswith("can be compared") else say.warn)(remark)
         for place in summary["drafts"]:
             show(f"wrote {place}")
@@ -88,12 +88,12 @@ def _show(summary: Mapping[str, Any], every_stream: bool) -> None:
 
 # Columns of :func:`account_rows`.
 ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "start UTC", "s")
-# A kind with more streams than this, as in a wide table, is only counted.
+# If a kind has more streams than this, as in a wide table, only the number of streams is shown.
 _MOST_NAMED = 6
 
 
 def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tuple[str, list[list[str]]]:
-    """Return the folder that all paths share, or an empty text, and a row of :data:`ACCOUNT` per file.
+    """Return the common folder of all paths, or an empty text, and one row with the columns :data:`ACCOUNT` per file.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> li
         f"{kind}: {', '.join(names) if every_stream or len(names) <= _MOST_NAMED else f'{len(names)} (--all)'}"
         for kind, names in kinds.items()
     )
-    # use a set, because streams of one log mostly have the same rate
+    # use a set, so that a rate that several streams of a log have is printed once
     rates = {"-" if stream["rate_hz"] is None else _rate_words(stream["rate_hz"]) for stream in file["streams"]}
     return [
         str(Path(file["path"]).relative_to(folder) if folder else file["path"]), file["reader"], streams or "-",

@@ -201,7 +201,7 @@ def channel(
 
 
 def _print(outcome: Any, sentence: str) -> None:
-    """Print a sentence, warnings and files, or only the metrics as JSON."""
+    """Print a sentence, warnings and paths of files, or only the metrics as JSON if ``--json`` is set."""
     if answered(outcome.metrics):
         return
     show(sentence)

@@ -1,4 +1,4 @@
-"""Reports, in detail and compared: ``explain``, ``diff``, ``campaign``."""
+"""Commands that explain and compare reports: ``explain``, ``diff``, ``campaign``."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _print_explanation(explanation: Any) -> None:
     heads = ["path", "m", "ns", "departure az / el deg", "arrival az / el deg", "dBm", "phase deg"]
     if rows:
         table(heads, rows, f"{counted(len(rows), 'path')} by engine {explanation.engine}")
-        # the path with the most interactions lists all terms in order
+        # take the order of the terms from the paths with the most interactions, which have the most terms
         deepest_first = sorted(explanation.paths, key=lambda path: -path.depth)
         names = list(dict.fromkeys(name for path in deepest_first for name in path.terms_db))
         power = f"{explanation.transmit_power_dbm:+.2f}"
@@ -168,7 +168,7 @@ def campaign(
     for check in outcome.failed_checks:
         say.warn(f"failed: {check}")
     if not (outcome.metrics["rss"] or outcome.metrics["rank"] or outcome.metrics["season"]["nodes"]):
-        # no flight could be compared with any settings, so the inputs are wrong
+        # return the exit code of a wrong input, because no flight could be compared with any of the settings
         return 3
     return 1 if outcome.metrics["failures"] or (strict and outcome.failed_checks) else 0
 

@@ -73,12 +73,7 @@ def test_the_unchanged_flight_passes(run: Run, tmp_path: Path) -> None:
         ("other_kind", {"power_log": GOOD_TELEMETRY}, 3, "vehicle_out"),
         ("no_overlap", {"power_log": GOOD_POWER.replace("2025-06-01", "2025-06-03")}, 3, "no overlap"),
         ("hours_off", {"power_log": GOOD_POWER.replace(" 10:", " 14:")}, 3, "stored as if they were UTC"),
-        (
-            "misnamed",
-            {"power_log": None, "power_logs": GOOD_POWER},
-            3,
-            "replace power_log.txt by power_logs.txt in flight.yaml",
-        ),
+        ("misnamed", {"power_log": None, "power_logs": GOOD_POWER}, 3, "replace power_log.txt by power_logs.txt in"),
         ("minus_999", {"vehicleOut": GOOD_TELEMETRY.replace("35.7274,", "-999,").replace("-78.69", "-999.69")}, 3, ""),
     ],
 )

@@ -129,15 +129,8 @@ def random_scene(rng, boxes=3, half=6, poses=12):
     solids = []
     for _ in range(boxes):
         west, south = (2 * rng.integers(-half // 2, half // 2, 2)).tolist()
-        solids.append(
-            (
-                west,
-                west + 2 * int(rng.integers(1, 4)),
-                south,
-                south + 2 * int(rng.integers(1, 4)),
-                int(rng.integers(1, 5)),
-            )
-        )
+        east, north = (low + 2 * int(rng.integers(1, 4)) for low in (west, south))
+        solids.append((west, east, south, north, int(rng.integers(1, 5))))
     ends = []
     while len(ends) < poses + 1:
         point = (*rng.integers(-half - 3, half + 4, 2).tolist(), int(rng.integers(0 if ends else 1, 7)))

@@ -30,7 +30,7 @@ from .result import BASELINE_TITLE
 from .statistics import Interval, mean_interval
 
 SECTORS = 6
-# Guard around a held-out sector [deg]: directions within it are not used for learning either.
+# Guard on both sides of a held-out sector [deg]. Directions within this guard are not used for learning either.
 _GUARD_DEG = 10.0
 
 _CRUISE_M = 5.0

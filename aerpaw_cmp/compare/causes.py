@@ -139,8 +139,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
             if any(either <= pair for pair in named):
                 continue
             lead = _lead(either, odds) / len(showing)
-            # an almost certain cause may leave an error that only an uncertain second cause explains, so also judge it
-            # together with the likeliest explanation
+            # an almost certain cause may leave an error that only an uncertain second cause explains, so also judge
+            # this cause together with the likeliest explanation
             apart = (beside, best) if lead >= _CERTAIN else (beside,)
             if any(all(_explains(other, showing, lead, rest - either) for other in either) for rest in apart):
                 named[either] = showing
@@ -156,8 +156,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         return _by_health(None, tables)
     # a gain over directions comes last, because it can look like many faults
     either = min(named, key=lambda e: (CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
-    # if one of two causes is a fault of the UAV, it must be likely on all channels, also on those without the other
-    # cause
+    # if one of two causes is a fault of the UAV, this fault must be likely on all channels, including channels without
+    # the other cause
     names = [
         name
         for name in _likeliest_first(either, best, odds)
@@ -542,7 +542,7 @@ _IN_LOGS = f"in `logs:` for {_CHANNELS}"
 
 
 def _fitted(e: LevelEvidence, *trials: Trial, at: NoiseParameters = START, search: bool = True) -> NoiseFit:
-    """Fit offset and coefficients of some faults, with the given noise or with the likeliest noise near it."""
+    """Fit offset and coefficients of some faults, with the given or with the likeliest noise."""
     target = e.measured_db - e.predicted_db
     clipped = np.zeros(len(target), dtype=np.bool_)
     shown = np.ones(len(target))
@@ -689,7 +689,7 @@ def _concentration(log_likelihood: FloatArray, width: FloatArray) -> float:
     return -math.log(float(np.exp(log_likelihood - top) @ width / width.sum()))
 
 
-# Interpolated values around a given value, as a share of the distance to its neighbour.
+# Positions of interpolated values around a given value, as a share of the distance to the neighbouring given value.
 _BETWEEN = np.linspace(-0.8, 0.8, 9)
 
 
@@ -895,10 +895,10 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     # a prediction without antennas is free space: doubled decibels then equal a path-loss exponent of 4
     alike = e.distance_db is not None and bool((e.predicted_db - e.distance_db).std() < SHOWN_DB)
     if alike:
-        # near its maximum, the log likelihood is a parabola
+        # fit a parabola, because the log likelihood is nearly a parabola around its maximum
         best, sd = _slope(e, np.polyfit(e.predicted_db, e.measured_db, 1)[0], 0.1, _fitted(e, slopes[0]).parameters)
         if best >= _STEEP:
-            # obstacles near the ground cause such an exponent; in the air it is unlikely
+            # obstacles near the ground cause such an exponent, which is unlikely in the air
             doubled = abs(best - 2.0) <= 1.96 * sd and np.nanmedian(e.place_m[:, 2]) > _NEAR_GROUND_M
             yield Trial(
                 name="exponent or decibels", cost=math.log(2.0), columns=slopes[0].columns,
@@ -1018,7 +1018,7 @@ def _limits(e: LevelEvidence) -> Iterator[Trial]:
         step = "check the receiver's input and gain"
         yield Trial(name="flat", cost=_RARE, sentence=sentence, next_step=step, change_db=-e.predicted_db)
         return
-    # if the lowest level is frequent, it marks samples without a detected signal, not a limit
+    # if the lowest level is frequent, this level marks samples without a detected signal, and is not a limit
     if e.least is None and not e.limits_known:
         yield from _clipping(e, 1.0)
     # signals below the noise do not overload a receiver
@@ -1059,7 +1059,8 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
     if inside.sum() < max(LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < LEAST_BINS:
         return None
-    # at a limit of the receiver, predicted levels are beyond the limit; with constant interference they are not
+    # at a limit of the receiver, the predicted levels are beyond the limit. With constant interference, they are not
+    # beyond it.
     error = e.measured_db - e.predicted_db
     missing = side * float(np.median(error[pile]) - np.median(error[~pile]))
     limited = np.median(step[inside]) < MOST_FADING * np.median(step[outside]) and missing > -_BEYOND_DB

@@ -120,7 +120,7 @@ class LevelEvidence:
 
 
 def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
-    """Return means of the samples with both levels over :data:`BIN_S` and over hovers. None if there are too few."""
+    """Return means over :data:`BIN_S` and over hovers of the samples with both levels, or None for too few samples."""
     finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
     level = evidence.measured_db[finite]
     # two levels or few samples do not show how the error varies
@@ -151,7 +151,8 @@ def in_bins(evidence: LevelEvidence) -> LevelEvidence | None:
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
-    # rounded levels all occur often: the lowest level is a floor only if it occurs at least as often as the next
+    # if levels are rounded, each level occurs often. The lowest level is a floor only if it occurs at least as often as
+    # the next higher level.
     next_often = (level == level[~at].min()).sum() if not at.all() else 0
     # count a run of equal levels as one measurement, because the log repeats levels
     usual_run = 1.0 + 2.0 * np.median(ages(np.arange(len(level)), level)[~at]) if not at.all() else 1.0

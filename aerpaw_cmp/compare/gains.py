@@ -752,8 +752,9 @@ SHARES = (0.5, 0.9, 0.95)
 BAND = 0.9
 
 
-# Usual SD of the offset between flights [dB]. This is a guess, because the data do not determine it: estimates from any
-# three of dataset 12, LTE, AFAR and NR range from 1.0 dB (without AFAR) to 2.8 dB (without dataset 12).
+# Usual SD of the offset between flights [dB]. This value is a guess, because the data do not determine this SD:
+# estimates from any three of dataset 12, LTE, AFAR and NR range from 1.0 dB (without AFAR) to 2.8 dB (without dataset
+# 12).
 USUAL_OFFSET_DB = 1.5
 
 

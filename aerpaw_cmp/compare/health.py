@@ -184,11 +184,11 @@ _STEP_CHI2, _FURTHER_CHI2 = 25.0, 4.0
 _BEFORE_SLOWER, _SLOW_S = 5.0, (100.0, 200.0)
 # A step must reduce the variance of the errors by at least this share of its own variance.
 _LEAST_TAKEN = 0.5
-# Largest mean square of the whitened error after a step. For healthy flights at LW1 it is at most 1.2.
+# Largest mean square of the whitened error after a step. For healthy flights at LW1, this mean square is at most 1.2.
 _MOST_SQUARE = 1.6
 # Smallest number of means before and after a step (one minute).
 _LEAST_EACH_SIDE = 15
-# Largest chi-squared of another step in the residual. 99 % of simulated healthy flights are below it.
+# Largest chi-squared of another step in the residual. 99 % of simulated healthy flights are below this limit.
 _MOST_LEFT_CHI2 = 18.0
 
 
@@ -209,7 +209,7 @@ class Judged:
 
     @property
     def health(self) -> LearnedHealth:
-        """Usual errors of the channel. The learned antenna must contain them."""
+        """Usual errors of the channel. The learned antenna must contain these errors."""
         assert self.learned.health is not None
         return self.learned.health
 

@@ -170,7 +170,7 @@ def compare_models(
     candidates: Sequence[CandidateModel],
     position_m: Sequence[FloatArray],
 ) -> ModelComparison:
-    """Score models on held-out areas. No model is scored or recommended if they share fewer than 20 samples.
+    """Score models on held-out areas. No model is scored or recommended if the models share fewer than 20 samples.
 
     Parameters
     ----------

@@ -181,7 +181,7 @@ def without_errors(score: RssComparison) -> RssComparison:
 
 
 # Levels are outliers if they are more than this number of interquartile ranges outside the quartiles. In a normal
-# distribution, that is one in 10^9 levels. Deep fades of real flights are not that far outside.
+# distribution, one in 10^9 levels is an outlier by this rule. Deep fades of real flights are not that far outside.
 _FENCE = 4.0
 
 # Smallest interquartile range that is used [dB], because levels of a hovering UAV hardly vary.
@@ -219,7 +219,7 @@ def _rmse_interval(difference: FloatArray, fit: OffsetFit, place_m: FloatArray |
     return rmse_interval(difference[known] + fit.offset_db, fit.rmse_db, place)
 
 
-# --- both sides averaged over the same window ----------------------------------------------------------------------
+# --- measured and simulated levels averaged over the same window ----------------------------------------------------
 
 
 def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> FloatArray:
@@ -447,7 +447,9 @@ def channel_difference(
     position_m: FloatArray | None = None,
     context: Mapping[str, ArrayLike] | None = None,
 ) -> ChannelDifference:
-    """Return the difference of two channels, with segments where it deviates from its mean by > :data:`PART_DB`.
+    """Return the difference of two channels, with segments in which the difference deviates from its mean.
+
+    A segment deviates by more than :data:`PART_DB`.
 
     Parameters
     ----------
@@ -707,7 +709,8 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     above = measured > floor_db
     middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
     grid = offset_grid(span_db=(middle - _SPAN_DB, middle + _SPAN_DB))
-    # with sorted predictions, the first k are below the floor and set to it; all others shift with the offset
+    # of the sorted predictions, the first k are below the floor and raised to the floor; all others shift with the
+    # offset
     low = np.concatenate([[0.0], np.cumsum((measured - floor_db) ** 2)])
     difference = simulated - measured
     first, second = (np.concatenate([[0.0], np.cumsum(difference**power)]) for power in (1, 2))

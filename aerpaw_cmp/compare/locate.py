@@ -93,8 +93,8 @@ _KNOWN_ODDS = 3.0
 
 # Standard deviations of the gain over azimuth at the node and over direction at the airframe [dB]. If the attitude is
 # unknown, the airframe's axes are taken as those of the site, and larger standard deviations are also tried, with the
-# prior weights below. If the attitude is known, larger ones are not tried: they raised the error of one of six real
-# flights from 41 to 67 m.
+# prior weights below. If the attitude is known, larger standard deviations are not tried, because they raised the error
+# of one of six real flights from 41 to 67 m.
 _GAINS = (0.8, 1.5)
 _STRONG_GAINS = {_GAINS: 0.55, (3.0, 3.0): 0.28, (6.0, 6.0): 0.17}
 

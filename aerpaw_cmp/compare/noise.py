@@ -71,7 +71,8 @@ def _whitening(parameters: NoiseParameters) -> tuple[tuple[float, float, float],
     The sum of two first-order autoregressive sequences is an ARMA(2, 1) sequence (Granger and Morris).
     """
     share = _SLOW_SHARE[parameters.share]
-    # set the correlation of a part with a share of 0 to 0: equal noise then has exactly equal likelihoods
+    # set the correlation of a part with a share of 0 to 0, so that parameters of the same noise have exactly equal
+    # likelihoods
     slow, fast = _SLOW[parameters.slow] * (share > 0.0), _FAST[parameters.fast] * (share < 1.0)
     shocks = share * (1.0 - slow**2), (1.0 - share) * (1.0 - fast**2)
     power = shocks[0] * (1.0 + fast**2) + shocks[1] * (1.0 + slow**2)

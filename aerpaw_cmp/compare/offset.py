@@ -23,7 +23,7 @@ STEP_DB = 0.1
 # Largest number of offsets. A longer grid is the result of a wrong step or range, and would not fit in memory.
 MAXIMUM_OFFSETS = 10_000_000
 
-# Largest magnitude of a level that is used [dB]. Larger levels are clipped to it.
+# Largest magnitude of a level that is used [dB]. Larger levels are clipped to this magnitude.
 _LARGEST_DB = 1e150
 
 # Distances that differ by less than this share of a step count as equal (0.15 is exactly between 0.1 and 0.2).
@@ -107,7 +107,7 @@ class Moments:
 
 
 def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Moments:
-    """Return the moments of the pairs with both sides finite, NaN if there are no pairs.
+    """Return the moments of the pairs in which both levels are finite, NaN if there are no such pairs.
 
     Examples
     --------

@@ -190,7 +190,7 @@ def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
 
 
 def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Return both ranks as integers, 0 if missing."""
+    """Return the measured and the simulated ranks as integers, 0 if missing."""
     ranks = _ranks(measured), _ranks(simulated)
     # comparisons with NaN (no report) are False, so NaN becomes 0
     first, second = (np.where(rank >= 1, rank, 0).astype(np.int64) for rank in ranks)
@@ -198,7 +198,7 @@ def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray
 
 
 def _pairs(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
-    """Return both ranks as integers, for poses at which both exist (not NaN, not 0)."""
+    """Return the measured and the simulated ranks as integers, for poses at which both exist (not NaN, not 0)."""
     first, second = _both(measured, simulated)
     existing = (first > 0) & (second > 0)
     return first[existing], second[existing]
@@ -634,7 +634,7 @@ def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> Co
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankRepeat:
-    """The agreement of two passes over the same positions. No model can be expected to exceed it.
+    """The agreement of two passes over the same positions. No model can be expected to exceed this agreement.
 
     Parameters
     ----------

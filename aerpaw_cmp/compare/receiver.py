@@ -169,7 +169,8 @@ def score_forecast(
     )
 
 
-# Smallest ratio of singular values. Smaller ratios are raised to it, because no receiver uses such a stream.
+# Smallest ratio of singular values. Smaller ratios are raised to this limit, because no receiver uses a stream with
+# such a ratio.
 FLOOR_DB = -40.0
 
 # Candidate ridge penalties on coefficients of standardised features, relative to the log likelihood of the whole

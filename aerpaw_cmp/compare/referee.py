@@ -35,7 +35,7 @@ def level_card(
     *,
     absolute: bool = True,
 ) -> dict[str, Any]:
-    """Return the scores of a predicted level on the samples that both prediction and measurement have.
+    """Return the scores of a predicted level on the samples that have a predicted and a measured level.
 
     Parameters
     ----------

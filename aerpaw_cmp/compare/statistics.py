@@ -90,9 +90,8 @@ _SECOND_PART = 0.3
 # cosine term would exceed the noise, but the mean of the process would vary.
 _VISIBLE = 6.0
 
-# Number of bins of a pooled sequence for the terms of its channels, and a standard deviation for independent channels.
-# It is that of the logarithm of a ratio: the power of the sum of the channels to the sum of their powers. For a known
-# correlation, it is 0.2.
+# Number of bins of a pooled sequence from which the terms of its channels are computed. Standard deviation of log(power
+# of the sum of independent channels / sum of the powers of the channels), which is 0.2 for a known correlation.
 _BINS, _SUM_OF_POWERS = 1024, 0.3
 
 # File with the logarithms of the prior weights, in tenths, by kind, form (exponential with each white share, then
@@ -106,7 +105,7 @@ _TABLES = Path(__file__).with_name("memory_weights.json")
 CALM = 1.8
 
 # Number of parts of a flight whose powers are compared, the multiple of the median power above which a part is loud
-# (has unusually large errors), and the smallest number of samples. In the simulations of
+# (has unusually large errors), and the smallest number of samples for this comparison. In the simulations of
 # ``benchmarks/coverage_of_intervals.py``, fewer than 1 % of steady flights have two loud parts, and 4 % of flights with
 # 100 samples of Student's t with four degrees of freedom.
 _PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
@@ -564,7 +563,8 @@ def power_draws(values: FloatArray, place_m: Track = None) -> FloatArray:
     known = weighted_correlations("power", len(terms.slow), place_m)
     index, scale, stretch = _picked(terms.slow, known)
     *_, normal, second_normal = _random(len(terms.slow))
-    # errors that depend on the position repeat when the UAV returns to it, so their power has fewer independent squares
+    # errors that depend on position repeat when the UAV returns to a position, so their power has fewer independent
+    # squares
     placed = np.minimum(scale * known.joined("beyond")[index] / max(terms.fast_power, 1e-300), 1.0)
     third = 2.0 / 9.0 * np.maximum(1.0 / terms.fast_freedom, placed**2 / known.joined("freedom")[index])
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
@@ -585,7 +585,7 @@ def power_draws(values: FloatArray, place_m: Track = None) -> FloatArray:
 # Half the 95 % interval of a standard normal variable.
 _NORMAL_95 = 1.959964
 
-# Width of an interval relative to its value above which only its lower end is reported.
+# If the width of an interval exceeds this multiple of the estimate, only the lower end of the interval is reported.
 _BOUND = 2.0
 
 # Number of segments of a flight. The regression coefficient for a segment is fitted to all other segments.

@@ -47,7 +47,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Return the channels without copies that have enough samples and an offset inside its search range.
+    """Return the channels without copies that have enough samples and an offset inside the search range.
 
     If any of these channels has a signal, channels without a signal are omitted.
     """
@@ -314,7 +314,7 @@ class Verdict:
 # --- campaign -------------------------------------------------------------------------------------------------------
 
 
-# A shift of an offset: its p-value, and its verdict.
+# A candidate for an irregularity of a campaign: its p-value, and its verdict.
 _Shift = tuple[float, Verdict]
 
 
@@ -357,7 +357,7 @@ def _shifts(
     for i, chance, effect, ends in _each_alone(np.log([errors_db[name] for name in names])):
         low, high = np.exp(ends)
         ratio = Verdict(cause="outlying error", effect=math.exp(effect), interval=(low, high), where=names[i])
-        # ignore flights with a smaller error than all others
+        # ignore flights with a smaller error than all other flights
         yield (chance if effect > 0.0 else math.nan), ratio
     about: dict[str, list[float]] = {}
     for link, of in offsets_db.items():
@@ -468,7 +468,8 @@ def antenna_or_place(against: Sequence[Verdict]) -> Verdict:
 # wider interval is used for the bias.
 _TWO_TRIED = 1.3
 
-# Errors agree with their stated standard deviation if the ratio of both is between 1 / this number and this number.
+# Errors agree with their stated standard deviation if the ratio of actual errors to this standard deviation is between
+# 1 / this number and this number.
 _LEAST_RATIO = 1.15
 
 
@@ -505,8 +506,9 @@ def stated_errors(
     bias = Verdict(cause="biased", effect=mean, interval=(mean - reach, mean + reach))
     ratio = error / sd
     low, high = statistics.spread_interval(ratio, place)
-    # An error that is common to the whole flight does not contribute to the standard deviation within the flight. It
-    # can hide that an interval is too narrow, but cannot make it look too wide.
+    # An error that is common to the whole flight does not contribute to the standard deviation within the flight. Such
+    # an error can hide that an interval is too narrow. It must not make an interval look too wide, so its variance is
+    # added to the upper end below.
     allowed = share / float(np.mean(sd**2))
     effect, within = float(np.sqrt(np.mean(ratio**2))), float(ratio.std())
     spread = Verdict(effect=effect, interval=(low, max(effect, math.sqrt(high**2 + allowed))))
@@ -832,7 +834,7 @@ class Changed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overlap:
-    """The number of samples of the first report, of the second report, and of both."""
+    """The number of samples of the first report, of the second report, and of both reports in common."""
 
     first: int
     second: int

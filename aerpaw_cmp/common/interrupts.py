@@ -109,7 +109,7 @@ def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> l
     """Set a handler for signals whose handler is in ``untouched`` (default: Python's), and return the old handlers."""
     if threading.current_thread() is not threading.main_thread():
         return []
-    # a program that embeds this one may handle its signals, so keep its handlers
+    # keep the handlers of a program that embeds this package
     untouched = untouched or (signal.SIG_DFL, signal.default_int_handler)
     ours = [(number, signal.getsignal(number)) for number in numbers if signal.getsignal(number) in untouched]
     for number, _ in ours:

@@ -181,7 +181,7 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
             book["x"].attrs[name] = book.attrs[name] = value
         book.flush()
         read(book.id.get_file_image())  # let h5py and NumPy import everything, because files cannot be opened later
-    # load zipfile, because answer() needs it when files cannot be opened
+    # load zipfile now, because answer() needs this module when files cannot be opened
     np.savez(io.BytesIO(), np.zeros(1))
     return read
 

@@ -26,7 +26,7 @@ SPEED_OF_LIGHT_MPS = 299_792_458.0
 # CODATA 2018.
 VACUUM_PERMITTIVITY_F_PER_M = 8.854_187_8128e-12
 
-# Poses below this height above ground are raised to it (arXiv 2502.10324, section V).
+# Poses below this height above ground are raised to this height (arXiv 2502.10324, section V).
 MINIMUM_HEIGHT_M = 0.5
 
 # International foot [m] (exact).

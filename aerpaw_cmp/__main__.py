@@ -30,7 +30,7 @@ BROKEN_PIPE = 141
 # A shell sets this variable to request completions of the command line.
 _COMPLETE = "_AERPAW_CMP_COMPLETE"
 # With this variable, Typer reads the name of the shell from the command line instead of from the parent process, which
-# may not be a shell.
+# may not exist.
 _SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
 ISSUES = "the project's issue tracker"
 # Variables that limit the threads of BLAS. The program solves many small systems, for which several threads would wait

@@ -1,7 +1,6 @@
 """Checks whether this machine can run this program. Each check reports what it found, and how to fix a problem.
 
-The checks do not change the machine. Missing LLVM libraries are set up by ``tools/setup_llvm.py``, which ``make setup``
-runs.
+The checks do not change the machine. ``tools/setup_llvm.py``, which ``make setup`` runs, can install LLVM.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ tools), the gain towards both ends at once, and the directions in which a gain i
 from __future__ import annotations
 
 import copy
+import csv
 import gzip
 import hashlib
 import json
@@ -1018,7 +1019,7 @@ def _is_gain(columns: FloatArray) -> bool:
 
 def _row(line: str, number: int, width: int, path: Path) -> list[float]:
     """Return the numbers of a line. Raise InputError if they are not a direction with its gain."""
-    cells = line.split(",")
+    cells = next(csv.reader([line]))
     with suppress(ValueError):
         row = [float(cell) for cell in cells]
         if len(row) == width and _is_gain(np.array(row)):

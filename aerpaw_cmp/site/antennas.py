@@ -43,7 +43,8 @@ _HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 # Measured antennas have about 0.5.
 _MINIMUM_EFFICIENCY = 0.01
 
-# Likely cause of a mean gain that no antenna can have. If the values look linear, another cause is reported.
+# Likely cause in the message about a mean gain that no antenna can have. If the values look linear, another cause is
+# reported.
 NOT_GAIN = "the values are not gain over isotropic"
 
 # Largest plausible gain. A file with a higher gain is not in dBi.
@@ -68,7 +69,7 @@ class Isotropic:
 
 @dataclass(frozen=True, slots=True)
 class HalfWaveDipole:
-    """A half-wave dipole along z with 2.15 dBi (Balanis, Antenna Theory, eq. 4-84).
+    """A half-wave dipole along z with a peak gain of 2.15 dBi (Balanis, Antenna Theory, eq. 4-84).
 
     Source: Balanis eq. 4-84.
     """
@@ -265,10 +266,10 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
 
     Notes
     -----
-    The direction of phi follows from the poles, where the two components must describe the same vector for all phi. The
-    poles therefore show whether E_phi points along increasing phi. If it points the other way, as in AERPAW's files,
-    phi is the angle of a turntable and azimuth is -phi (``rad_pat.mat`` lists the same measurement in this way). If the
-    poles radiate too little to decide, the direction of AERPAW's files is used.
+    At a pole, E_theta and E_phi must describe the same vector for all phi. The poles therefore show whether E_phi
+    points along increasing phi. If E_phi points the other way, as in AERPAW's files, phi is the angle of a turntable
+    and azimuth is -phi (``rad_pat.mat`` lists the same measurement with azimuth -phi). If the poles radiate too
+    little to decide, the direction of AERPAW's files is used.
     """
     path = Path(path)
     rows = _read_rows(path)
@@ -278,7 +279,7 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
     along = _points_along_phi(e_theta.T, e_phi.T)
-    # phi is then the angle of a turntable, whose direction is opposite to azimuth
+    # if E_phi does not point along phi, phi is the angle of a turntable, which increases opposite to azimuth
     if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
@@ -344,7 +345,7 @@ def _read_rows(path: Path) -> _Rows:
 
 
 def _check_last_line(text: str, rows: _Rows) -> None:
-    """Refuse a truncated file: its last line has no line end, and a shorter last number than all other lines."""
+    """Refuse a truncated file: its last line has no line end, and fewer decimals than all other lines."""
     if not rows.lines or text.endswith(("\n", "\r")):
         return
     lines = text.splitlines()
@@ -466,9 +467,9 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
 
     A negative theta is a point on the meridian at phi + pi.
 
-    At these points, some files contain spherical components. Others contain the components along the cut, which have
-    the opposite sign. Both cases are distinguished by continuity: the field must be smooth where phi wraps around, and
-    along each meridian next to the poles.
+    At points with negative theta, some files contain spherical components. Other files contain the components along the
+    cut, which have the opposite sign. The two kinds of files are distinguished by continuity: the field must be smooth
+    where phi wraps around, and along each meridian next to the poles.
     """
     # column with theta = 0
     middle = folded.shape[2] // 2

@@ -1,10 +1,10 @@
 """Buildings, forests and geofences from map files: classified, projected, repaired, with a list of all actions.
 
-The height of a building is its ``height`` tag, else ``building:levels`` times 3 m, else the height of the outline
-around a part, else a default. The number of default heights is reported. A building's outline is replaced by its parts
-where they cover it. Overlapping buildings of equal height are joined. If the heights differ, the overlap belongs to the
-higher building. Holes are retained. Slivers and duplicates are removed. Single trees have their tagged sizes, and tree
-rows become trees along their line.
+The height of a building is its ``height`` tag, else ``building:levels`` times 3 m, else (for a part of a building) the
+height of the outline that contains the part, else a default. The number of default heights is reported. Where parts
+cover the outline of a building, the parts replace the outline. Overlapping buildings of equal height are joined.
+If the heights differ, the overlap belongs to the higher building. Holes are retained. Slivers and duplicates are
+removed. Single trees have their tagged sizes, and tree rows become trees along their line.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ _LOWEST_M = 0.01
 # Outlines farther than this from the origin do not belong to the site.
 FAR_M = 20_000.0
 
-# Area of a site without a base: the part of the map within the first distance of the first tower (east-west and
-# north-south), and the second distance around each tower.
+# Area of a site without a base: the part of the map within the first distance [m] of the first tower (east-west and
+# north-south), and at least the second distance [m] around each tower.
 _AROUND_M, _NEAR_TOWER_M = 2000.0, 500.0
 
 # Smallest and largest number of elevations for a surface (its computing time grows with the cube of the number), and
@@ -88,7 +88,7 @@ _ROW_SPACING_M = 10.0
 
 _MAXIMUM_ROW_TREES = 10_000
 
-# Number of outlines between two progress reports. So many outlines take a second on a slow machine.
+# Number of outlines between two progress reports. On a slow machine, they take about a second.
 _OUTLINES_PER_REPORT = 1000
 
 
@@ -294,11 +294,11 @@ def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
 
 
 def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> list[_Shape]:
-    """Return forests without the parts far outside the site."""
+    """Return forests without their parts outside ``near``, and report each larger loss in ``actions``."""
     near_shapes = []
     for shape in shapes:
         inside = shape.area if near is None else _areas_only(shape.area.intersection(near))
-        # a smaller part is a rounding error and is not reported
+        # a loss of less than 0.1 % of the area is a rounding error and is not reported
         if inside.area < 0.999 * shape.area.area:
             lost = (shape.area.area - inside.area) / 1e4
             actions.append(
@@ -344,7 +344,7 @@ def _fill(result: Footprints, shapes: dict[mapfiles.Kind, list[_Shape]], canopy_
 
 
 def _check_place(content: mapfiles.MapFile, frame: SiteFrame) -> None:
-    """Refuse a file whose outlines are all far away. The message says if swapped coordinates would be near."""
+    """Refuse a file whose outlines are all far away. The message reports if swapped coordinates would be near."""
     positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer]
     positions += [p for tree in content.trees for p in tree.positions]
     if not positions:
@@ -565,7 +565,7 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
 
 
 def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
-    """Return outlines with their parts cut out, because the heights of parts are more accurate."""
+    """Return outlines with their building parts cut out, because parts have more accurate heights than the outline."""
     parts = [shape for shape in shapes if shape.part]
     if not parts:
         return shapes

@@ -203,8 +203,8 @@ class LearnedHealth(StrictModel):
     step_chi2 : float
         Largest chi-squared of a step of the level in these flights.
     channel_difference_sd_db : mapping of str to float
-        For each other channel of the tower: SD over flights of the offset of this channel minus the offset of the
-        other.
+        For each other channel of the tower: SD over flights of the difference between the offsets of this channel and
+        of the other channel.
     below_lock_share : float, optional
         Mean share of samples without lock. None if the receiver does not report its lock.
     run_s : float
@@ -293,7 +293,7 @@ class LearnedReceiver(StrictModel):
 
 
 class Entry(StrictModel):
-    """The antennas and receivers of one campaign, learned by one calibration.
+    """The antennas and receivers of one campaign, as learned by one run of the calibration.
 
     Parameters
     ----------
@@ -397,9 +397,9 @@ def readable_index(folder: Path) -> tuple[Learned, dict[str, str], UsageError | 
     Learned
         The index without unreadable entries.
     dict of str to str
-        The commands that learn these entries again, by name.
+        The commands that learn the unreadable entries again, by name of the entry.
     UsageError or None
-        The damage, or None for an index that is not damaged.
+        Error that describes the damage, or None if the index is intact.
 
     Raises
     ------
@@ -773,7 +773,7 @@ class PairGain:
             part = slice(start, start + 4096)
             across = gaussian_kernel(directions[part], self.directions, self.length)
             gain[part], known = self._factor.condition(across, white)
-            # due to rounding, the share can exceed 1 at a known direction
+            # due to rounding, the explained share of the variance can exceed 1 at a known direction
             known = np.minimum(known, 1.0)
             near = across @ self.sd_db**2 / np.maximum(across.sum(axis=1), 1e-12)
             away = apart_sd_db[part] ** 2 + self.prior_sd_db**2
@@ -1053,8 +1053,8 @@ def _check_grid(azimuth: FloatArray, elevation: FloatArray, count: int, path: Pa
 def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes: Sequence[str] = ()) -> str:
     """Return comments and the two principal cuts as MSI Planet text: attenuation below the peak, 360 lines each.
 
-    HORIZONTAL is clockwise as seen from above, as in planning tools. VERTICAL begins at the horizon in front and first
-    goes down.
+    Angles of the cut HORIZONTAL increase clockwise as seen from above, as in planning tools. The cut VERTICAL begins at
+    the horizon in front, and its angles increase downwards.
 
     Parameters
     ----------
@@ -1124,7 +1124,7 @@ def read_direction_covariance(path: Path, written: Written | None = None) -> Dir
 
 
 def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, LearnedAntenna]:
-    """Return the table of a learned antenna and its error model.
+    """Return the path of the table of a learned antenna, and the properties of the antenna with its error model.
 
     Parameters
     ----------
@@ -1185,7 +1185,7 @@ def check_band(learned_hz: float, used_hz: float, band: float, key: str = "") ->
     Raises
     ------
     UsageError
-        If the carriers differ by more.
+        If the relative difference of the carriers exceeds ``band``.
     """
     if abs(used_hz / learned_hz - 1.0) > band:
         raise UsageError(

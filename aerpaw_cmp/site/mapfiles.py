@@ -3,8 +3,8 @@
 Elements are returned unchanged, and :mod:`.footprints` cleans them. An element that cannot be used is skipped and
 listed by its number, id or name. Only a file that is not a map file is an error.
 
-The file also reads the tags of OpenStreetMap (kind of an object, height, material), and converts its model of nodes,
-ways and relations to outlines, for OSM XML and Overpass JSON.
+This module also reads the tags of OpenStreetMap (kind of an object, height, material). For OSM XML and Overpass JSON,
+it converts nodes, ways and relations to outlines.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class TreeLine:
 
 @dataclass(slots=True)
 class MapFile:
-    """The outlines and trees of a file, sentences about skipped elements, and the source of the data if it is known.
+    """The outlines and trees of a file, sentences about skipped elements, and the data source if it is known.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def is_part(tags: Mapping[str, str]) -> bool:
 
 
 def below_ground(tags: Mapping[str, str]) -> bool:
-    """Check whether no part of a building is above the ground.
+    """Check whether a building is completely below the ground.
 
     Examples
     --------
@@ -301,7 +301,9 @@ _STOREYS = re.compile(r"(building)?levels|(n|num|no|noof|numberof)?(floors|stor(
 
 
 def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
-    """Return the height of a building [m] from any of the tags that programs use, in the unit of the tag or value.
+    """Return the height of a building, converted to metres, from any of the tags that programs use.
+
+    The unit is read from the value, from the name of the tag, or from a tag ``NAME_unit``.
 
     Examples
     --------

@@ -32,8 +32,8 @@ _RIPPLE_DB = 1.0
 # Largest mean gain over the sphere of a pattern from two cuts [dB]: 0.5 dB for the measurement, 0.5 dB for the
 # interpolation, which changed the mean of ten sector antennas and arrays by -0.3 to +0.2 dB.
 _MOST_OF_CUTS_DB = 1.0
-# Limit for a learned antenna, whose level is not known. For cuts through the only lobe of such an antenna,
-# interpolation added 3.7 dB.
+# Largest mean gain over the sphere of a pattern from cuts of a learned antenna, whose absolute gain is not known [dB].
+# For two cuts through the only lobe of such an antenna, the interpolation increased the mean gain by 3.7 dB.
 _MOST_OF_LEARNED_CUTS_DB = 5.0
 _PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
 _GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
@@ -180,7 +180,7 @@ def _from_cuts(
     horizontal, vertical = cuts["HORIZONTAL"], cuts["VERTICAL"]
     theta, around, _ = sphere_grid(STEP_DEG)
     below = theta - 90.0
-    # weight of the back of the vertical cut
+    # the weight of the back of the vertical cut increases with the azimuth from the front
     share = np.minimum(around, 360.0 - around) / 180.0  # 0 in front, 1 behind
     # angles of planning tools are clockwise, but azimuth is counter-clockwise
     level = _at(horizontal, -around)[None, :] + (1.0 - share)[None, :] * (_at(vertical, below) - horizontal[0])[:, None]

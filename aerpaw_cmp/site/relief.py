@@ -238,8 +238,8 @@ class Dem:
         Returns
         -------
         ndarray of bool, (links,)
-            True if no sample, two per cell, is lower than the ground. Unknown ground does not block. The curvature of
-            the Earth (0.08 m half-way along 2 km) is included, but refraction is not.
+            True if no sample of the line (two per cell) is lower than the ground. Unknown ground does not block. The
+            curvature of the Earth (0.08 m half-way along 2 km) is included, but refraction is not.
         """
         source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
         tolerance, free = np.broadcast_to(tolerance_m, len(source)), np.ones(len(source), dtype=bool)

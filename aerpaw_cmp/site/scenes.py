@@ -320,15 +320,17 @@ _DRAWN_TALLER_M = 1.0
 # Largest number of prisms that represent a scene in pictures.
 _DRAWN_MOST = 3000
 
-# A part of a shape is ground, including hills, if it covers a larger share of the plan than this.
+# A part of a shape is treated as ground (terrain and hills) if it covers at least this share of the rectangle around
+# the scene in plan view.
 _GROUND_PART = 0.25
 
 
 def drawn_buildings(site: Site) -> tuple[Building, ...]:
     """Return buildings for pictures: the buildings of the site, and prisms for the shapes of a scene of triangles.
 
-    Each prism extends from the lowest to the highest corner of its part. Horizontal shapes and shapes below most of the
-    plan are ground. Only pictures use these prisms.
+    Each prism extends from the lowest corner of the scene below its part to the highest corner of the part. Prisms that
+    would be at most 1 m high are not drawn. Parts that cover a quarter or more of the rectangle around the scene are
+    treated as ground and not drawn. Only pictures use these prisms.
     """
     return site.buildings if site.scene is None else (*site.buildings, *_outlines(site.scene))
 

@@ -219,7 +219,7 @@ def _round_step(step: float) -> float:
 
 
 def class_scale(key: str, title: str, names: Sequence[str]) -> Scale:
-    """Return a scale of the values 0, 1, ... with these names. The name "Z" means out of coverage."""
+    """Return the colour scale of the classes 0, 1, ..., labelled with ``names``. The name "Z" means out of coverage."""
     first = int(names[0] == "Z")
     classes = range(first, len(names))
     return Scale(

@@ -648,7 +648,7 @@ def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | s
     t = offset_m.shape[2]
     alone = slice(None), slice(None)
     if len(np.unique(np.round(offset_m[:, 0].sum(axis=0) / TIE_M))) == t:
-        return alone  # scattered samples: this test is ten times faster
+        return alone  # no two targets share offsets; this test is ten times faster than the comparison below
     # compare integers of a nanometre, which is more than the rounding error of coordinates of kilometres
     offset = np.round(offset_m.reshape(-1, t) / _SHARE_M).astype(np.int64)
     # the sum of the offsets with random odd factors, modulo 2^64, identifies a target

@@ -427,8 +427,8 @@ def basis_fields(
     table, elements = face_table(faces, carrier_hz), Elements.of(link)
     n, ports = len(poses), (len(uav), len(tower))
     index, zero, step = np.arange(n), np.zeros(n, dtype=np.int64), max(1, PAIRS_PER_CHUNK // (len(uav) * len(tower)))
-    # cosine and sine of a vertical and a horizontal port, in shapes that broadcast with (tower's slant, paths, pairs)
-    # and (UAV's slant, tower's slant, paths, pairs)
+    # cosine and sine of the slant of a vertical and of a horizontal port, in shapes that broadcast with (tower's slant,
+    # paths, pairs) and (UAV's slant, tower's slant, paths, pairs)
     upright, level = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     slants = [(upright.reshape(shape), level.reshape(shape)) for shape in ((2, 1, 1), (2, 1, 1, 1))]
     fields = np.zeros((2, 2, 2, n, *ports), dtype=np.complex128)

@@ -398,18 +398,18 @@ def _of_solid(
             continue
         near, far = (_point(faces, wall, end, top) for end in (0, 1))
         if top in roofs:
-            # t is in the plane of the wall and points down, so t x normal points along the wall
+            # t of the module docstring lies in the wall and points down, so t x normal points along the wall
             rows.append((far, near, (wall, roofs[top])))
         following = first.get(_corner(faces, wall, 1))
         # require a left turn: at an inner corner, the air is on the hollow side, and no wave is diffracted
         if following is not None and np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
-            # t is in the plane of the wall and points away from the corner
+            # t of the module docstring, the axis in face 0, lies in the wall and points away from the corner
             rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
     return rows
 
 
 def _point(faces: Faces, wall: int, end: int, height_m: float) -> FloatArray:
-    """Return the point at a height on a vertical side of a wall, the first or the last."""
+    """Return the point at a height on a vertical side of a wall: its first (``end`` 0) or last side (``end`` 1)."""
     at = (faces.lower, faces.upper)[end][wall, 0]
     return np.asarray(faces.normal[wall] * faces.offset_m[wall] + at * faces.along[wall] + [0.0, 0.0, height_m])
 

@@ -266,7 +266,7 @@ class Mirror:
         """Return the distance of a point of the plane from the face's edges [m], positive inside, negative outside."""
         if self.roof is not None:
             spot = Point(p[0], p[1])
-            # the boundary includes those of holes
+            # the boundary includes the edges of holes
             edge = float(self.roof.boundary.distance(spot))
             return edge if self.roof.covers(spot) else -edge
         if self.solid < 0:

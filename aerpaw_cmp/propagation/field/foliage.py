@@ -230,7 +230,7 @@ def foliage_depth_m(
 
 @lru_cache(maxsize=2)
 def crown_index(trees: Trees) -> CrownIndex:
-    """Return the spatial index of the cones of these trees. The last two are cached: a site has two kinds of ground."""
+    """Return the spatial index of the cones of these trees. The indices of the last two sets of trees are cached."""
     return CrownIndex(trees)
 
 

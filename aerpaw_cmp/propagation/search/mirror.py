@@ -306,7 +306,8 @@ MINIMUM_LENGTH_M = 0.01
 # Largest number of face sequences per tower of the ``image`` engine.
 _SEQUENCE_BUDGET = 200_000
 
-# Largest number of cells of a dense step, which limits its memory (8 MB per array).
+# Largest number of entries of an array over pairs (sequences and faces, or poses and sequences) that is computed at
+# once. It limits the memory to 8 MB per array.
 CELLS_PER_CHUNK = 1_000_000
 
 # Number of targets whose heights over all faces are cached.
@@ -727,7 +728,7 @@ def trace_back(
     tolerance_m : float
         Tolerance of side tests [m].
     edge_m : float, optional
-        Largest distance of a point outside its face [m]. Default: ``tolerance_m``.
+        Distance outside its face up to which a reflection point is still accepted [m]. Default: ``tolerance_m``.
 
     Returns
     -------

@@ -38,9 +38,9 @@ class Quantity:
         ``time``, ``position``, ``height``, ``angle``, ``velocity``, ``count``, ``doubt``, ``identity``, ``cell`` or a
         kind of stream: ``rss``, ``rank``, ``kpi``.
     names : tuple of str
-        Patterns that are searched in a plain name (:func:`plain`), the preferred pattern first.
+        Patterns that are searched for in a simplified name (:func:`plain`), the preferred pattern first.
     unit : str
-        The unit of the values, and of numbers without a unit.
+        Unit in which values are stored. It is also assumed for numbers without a unit.
     none : tuple of float
         Numbers that mean a missing value, in addition to those of :data:`UNAVAILABLE`.
     can_be : (low, high)
@@ -90,7 +90,7 @@ def _quantity(row: Mapping[str, Any]) -> Quantity:
 
 
 QUANTITIES = tuple(_quantity(row) for row in _FILE["quantities"])
-# Expressions that are searched in plain names.
+# Expressions that are searched for in simplified names (:func:`plain`).
 PATTERNS = {name: re.compile("".join(pieces)) for name, pieces in _FILE["patterns"].items()}
 ZONES: Mapping[str, Mapping[str, Any]] = _FILE["zones"]
 HINTS: Mapping[str, Sequence[str]] = _FILE["hints"]

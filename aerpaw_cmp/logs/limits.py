@@ -47,8 +47,8 @@ _GAIN_MPS2 = 10.0
 # Number of moves on either side of a step from which the speed is estimated.
 _AROUND = 3
 
-# Positions are stale if they do not change for this duration [s] (a receiver reports once a second) at this mean logged
-# speed [m/s].
+# Positions are stale if they stay the same for longer than the first number [s] although the mean speed is above the
+# second number [m/s]. A receiver reports once a second.
 _STALE_S, _STALE_MPS = 3.0, 1.0
 
 # A step back in time is shorter than this share of the neighbouring steps.

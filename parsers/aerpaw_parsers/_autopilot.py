@@ -170,7 +170,7 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     time_s = flight.position.time_s[timed]
     values: dict[str, AnyArray] = {name: column[timed] for name, column in flight.position.columns.items()}
     logged, above = values.pop("above_home_m", None), None
-    home_m = values["altitude_m"] - (0.0 if logged is None else logged)  # also before the first fix
+    home_m = values["altitude_m"] - (0.0 if logged is None else logged)  # before rows without a fix become NaN
     lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
     rows.mark(lost, "no_fix")
     for name in _pose.PLACE:
@@ -191,8 +191,9 @@ def _track(rows: Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)
 
 
-# Suspicious distance [m] between the position of the autopilot's filter and of its receiver (the filter follows the
-# receiver within seconds), the share of such positions that is reported, and the number of a 3-D fix.
+# Distance between the positions of the autopilot's filter and of its receiver above which a position is suspicious [m]
+# (the filter follows the receiver within seconds), the share of suspicious positions above which a warning is given,
+# and the code of a 3-D fix.
 _APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
 
 

@@ -251,10 +251,12 @@ def few(texts: Iterable[str]) -> bool:
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
-# A column and the level alternate if the median step of the level within one value of the column is less than a share
-# of the median step between values. The share is _SMALLER, or _SMALLER_IF_RARE if the value changes less than _FEWEST
-# times. Column and level alternate in a fixed order if at least _IN_TURN of the rows repeat the order of the rows
-# before. _FEWEST is also the smallest number of rows.
+# A column (such as the device) alternates together with the level if the level changes little between successive rows
+# with the same entry: the median change is below a share of the median change between neighbouring rows with different
+# entries. The share is _SMALLER, or _SMALLER_IF_RARE if the entry changes less than _FEWEST times. Entries alternate in
+# a fixed order if at least the share _IN_TURN of rows have the same entry as the row k before, where k is the number
+# of different entries, and at least the same share differ from the row directly before. Tables with fewer rows than
+# _FEWEST are not tested.
 _SMALLER, _SMALLER_IF_RARE, _IN_TURN, _FEWEST = 0.5, 0.2, 0.8, 8
 
 

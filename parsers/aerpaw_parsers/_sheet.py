@@ -278,7 +278,7 @@ class Sheet:
         return {name: self.numbers(i) for name in quantities if (i := self.find(name)) is not None}
 
     def named(self, *names: str) -> int | None:
-        """Return the first column whose plain name is one of ``names``, or None."""
+        """Return the first column whose simplified name (:func:`dictionary.plain`) is one of ``names``, or None."""
         return next((self._own.index(name) for name in names if name in self._own), None)
 
     def unit(self, column: int) -> str:
@@ -955,7 +955,7 @@ def _is_dated(sheet: Sheet, column: int) -> bool:
     return _stamps.is_dated(first) or (":" in first and sheet.find("date") is not None)
 
 
-# A clock has stopped if another clock advances by more than this while its time does not change [s].
+# A clock has stopped if its time stays the same while another clock advances by more than this [s].
 _STANDS_S = 0.5
 
 

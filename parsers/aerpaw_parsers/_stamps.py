@@ -427,7 +427,7 @@ _COMPACT = re.compile(r"((\d\d)(\d\d)(\d\d)[ T])?([01]\d|2[0-3])([0-5]\d)([0-5]\
 
 
 def _with_marks(match: re.Match[str]) -> str:
-    """Return a date with points, the day before the month, and a time with colons."""
+    """Return the matched digits with full stops in the date and colons in the time. The order is not changed."""
     date = ".".join(match.group(2, 3, 4)) + " " if match[1] else ""
     return date + ":".join(match.group(5, 6, 7))
 
@@ -453,13 +453,13 @@ def refuse_spreadsheets(texts: Sequence[str]) -> None:
             raise InputError(f"the times are {found}, such as {shortened[0]}", expected=expected, cause=cause)
 
 
-# Longest flight [s], longest step between its rows [s], and for each unit the smallest step of numbers without a stated
-# unit. Steps of 10 may be 10 ms, but steps of 5 must be 5 s.
+# Longest flight [s], longest step between its rows [s], and, if no unit is stated, the smallest step between numbers
+# for which each unit is considered. Steps of 10 may be 10 ms, but steps of 5 must be 5 s.
 _FLIGHT_S, _LONGEST_STEP_S = 10_800.0, 60.0
 _LEAST_STEPS = {"s": 0.0, "ms": 10.0, "us": 2e3, "ns": 2e6}
 # If numbers in seconds would be a log shorter than this [s], they may be minutes or hours.
 _SHORT_S = 60.0
-# Time steps of stationary loggers [s]. No program writes rows with steps of so many milliseconds.
+# Time steps of stationary loggers [s]. No program writes rows with steps of 900, 1800 or 3600 ms.
 _QUARTERS = (900.0, 1800.0, 3600.0)
 # Shortest time between rows that a program of a radio or an autopilot writes [ns].
 _LEAST_NS = 1e6

@@ -152,7 +152,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     place = series["POS"] if len(series["POS"].time_s) else gps
     if "Lat" not in place.columns or "Lng" not in place.columns:
         place = _autopilot.Series(gps.time_s[:0], gps.number[:0], {"Lat": gps.time_s[:0], "Lng": gps.time_s[:0]})
-    names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # a receiver with a single antenna has no yaw
+    names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # without Yaw: one antenna does not measure it
     position = _named(place, *(name for name in names if name in place.columns))
     position.columns.setdefault("altitude_m", np.full(len(place.time_s), np.nan))
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)

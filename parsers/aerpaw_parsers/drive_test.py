@@ -541,7 +541,7 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
     """
     if sheet.program is None or "level" not in sheet.program.words:
         return
-    # levels of 0 dBm and more are steps of older phones
+    # values of 0 and above are not dBm but index steps that older phones write
     if (rssi := sheet.named("lterssi")) is not None:
         sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
     technology, levels = sheet.find("technology"), [i for i in map(sheet.named, ("level", "qual")) if i is not None]
